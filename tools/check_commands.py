@@ -29,8 +29,8 @@ from mauvecl.runs.pool import LocalWorkers, Pool
 from mauvecl.schema.errors import InputError
 from mauvecl.web.closed_forms import ClosedForms, FieldValues
 from mauvecl.web.fields import FIELDS, IDEAL, UPLOADED_FILE, Choice, Number
-from mauvecl.web.page import TABS, State, reads_of
-from mauvecl.web.tab import Tab, commands_and_programs, simulate
+from mauvecl.web.page import TABS, State, commands_and_programs, reads_of
+from mauvecl.web.tab import Tab, simulate
 
 #: Names of the commands' files, where they are not those of the page.
 WRITTEN = {"observation": "observation-2", "snr": "snr-element"}

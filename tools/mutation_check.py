@@ -53,7 +53,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "paper's conventions without its instrument": (
         "test_defaults_are_realistic_unlike_those_of_the_paper",
-        ('update={"instrument": FORMERLY_MAUVE})', "update={})"),
+        ('self.ideal().with_value(("observation", "instrument"), FORMERLY_MAUVE)', "self.ideal()"),
     ),
     "an ideal answer of Python with the unknowns": (
         "test_keywords_ask_what_flags_ask[ideal]",

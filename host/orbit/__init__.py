@@ -10,6 +10,8 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, OptionalNumber, Range, Unit, as_typed
 from mauvecl.schema.section import Section, read_declinations, setting
 
+#: Model of the orbit: the propagated elements, the mean orbit through them, or the one that suits the distance in time.
+OrbitKind = Literal["auto", "tle", "mean"]
 #: Angle between two directions; None for no limit.
 Separation = Annotated[float | None, Unit("deg"), Range(0, 180), OptionalNumber()]
 

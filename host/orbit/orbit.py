@@ -11,13 +11,14 @@ from functools import cached_property, lru_cache
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import erfa
 import numpy as np
 
 from mauvecl.host.arrays import Float
 from mauvecl.host.exposure.background import parse_position, parse_time
+from mauvecl.host.orbit import OrbitKind
 from mauvecl.host.stars.library import by_key, library_text, name_key, near_names
 from mauvecl.host.tables.files import parse_ecsv, read_text
 from mauvecl.host.tables.names import EXPECTED_POSITION, is_missing_position
@@ -25,7 +26,7 @@ from mauvecl.host.tables.units import offline
 from mauvecl.schema.calls import validated
 from mauvecl.schema.columns import records
 from mauvecl.schema.errors import InputError, printable, shortened
-from mauvecl.schema.fields import DAY_S, DateText, Duration, Range, Unit
+from mauvecl.schema.fields import DAY_S, DateText, Days, Duration
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -60,7 +61,7 @@ class TimeGrid:
     """
 
     start: DateText  # ISO 8601, UTC
-    days: Annotated[float, Unit("d"), Range(0, open_low=True)]  # length of the plan
+    days: Days  # length of the plan
     step_s: Duration = 60.0  # length of a step; conditions are evaluated at its middle
 
     def __post_init__(self) -> None:
@@ -246,7 +247,6 @@ class Elements:
         return float((GRAVITY / (2 * np.pi / self.period_s) ** 2) ** (1 / 3))
 
 
-Kind = Literal["auto", "tle", "mean"]
 #: Days from the epoch beyond which reports state the possible error of SGP4.
 TRUSTED_D = 14.0
 #: Days from the epoch beyond which "auto" uses the mean orbit: by then drag may have moved the satellite by a tenth of
@@ -271,10 +271,10 @@ class Orbit:
     """
 
     elements: Elements = field(default_factory=Elements.read)
-    kind: Kind = "auto"
+    kind: OrbitKind = "auto"
 
     @classmethod
-    def load(cls, file: str | Path | None = None, kind: Kind = "auto") -> Orbit:
+    def load(cls, file: str | Path | None = None, kind: OrbitKind = "auto") -> Orbit:
         """Read an orbit from a file of two-line elements; the default is the embedded set."""
         return cls(Elements.read(file), kind)
 

@@ -59,7 +59,7 @@ def survey_star(case: Case) -> Survey:
     variance, gain = np.where(used, quiet.variance_dn2, 0.0), quiet.gain_dn_per_electron
     signal = electrons * gain * used
     templates = Templates.of(variance, signal, gain, TEMPERATURES_K, nuisances=nuisances, rank=choice.sums)
-    level = choice.level(stare, case.study.stare.orbit_s)
+    level = choice.baseline(stare, case.study.stare.orbit_s)
     bank = Bank(
         choice.half_widths_s, templates.directions[list(templates.chosen)], shape_of(choice.shape), stare.frame_s, level
     )
@@ -77,7 +77,7 @@ def measure_of_size(case: Case) -> tuple[Size, float]:
     """
     measure, area = case.study.injections.of, shape_of(case.study.search.shape).equivalent_duration
     kind: Kind = "band" if measure == "band_energy" else "bolometric"
-    scale = case.study.flare.energy_scale(case.star, case.source, kind)
+    scale = case.energy_scale(kind)
     if measure == "amplitude" or (measure is None and scale is None):
         return "amplitude", 1.0
     if measure == "duration":

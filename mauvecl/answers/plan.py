@@ -96,7 +96,7 @@ class TargetObservation:
     @cached_property
     def scale(self) -> EnergyScale:
         """Bolometric energy of flares."""
-        scale = self.case.study.flare.energy_scale(self.case.star, self.case.source, "bolometric")
+        scale = self.case.energy_scale("bolometric")
         assert scale is not None
         return scale
 

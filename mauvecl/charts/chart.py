@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mauvecl.host.exposure.expectation import Expectation
 
-#: Colours on light ground by name, after Okabe & Ito; `web.figures.INKS` has those on dark ground as well.
+#: Colours on light ground by name, after Okabe & Ito; `web.tab.INKS` has those on dark ground as well.
 INK = {
     "text": "#1b2733", "grid": "#dde3ea", "ground": "#ffffff", "star": "#0072B2", "flare": "#D55E00", "sky": "#009E73",
     "drawn": "#6b7785", "dark": "#7b4ea3", "read": "#B8860B", "bias": "#A65082", "total": "#1b2733",

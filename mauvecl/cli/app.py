@@ -164,7 +164,7 @@ def add(
         raise InputError(f"--name {name!r} needs a single file, but {len(files)} are given", key="name")
     for file in files:
         star = add(file, name, replace=replace, wavelength_unit=wavelength_unit, flux_unit=flux_unit, extend=extend)
-        _tell(star, quiet)
+        _show_kept(star, quiet)
 
 
 @library_app.command()
@@ -187,7 +187,7 @@ def fetch(
 
     for name in names:
         shown = not quiet and sys.stderr.isatty()
-        _tell(fetch(name, base=base, replace=replace, show_progress=shown, extend=extend), quiet)
+        _show_kept(fetch(name, base=base, replace=replace, show_progress=shown, extend=extend), quiet)
 
 
 @library_app.command()
@@ -206,7 +206,7 @@ def remove(
             show([f"Removed {name}."])
 
 
-def _tell(star: OwnStar, quiet: bool) -> None:
+def _show_kept(star: OwnStar, quiet: bool) -> None:
     """Print the name of a kept star and what its use needs, unless `quiet`."""
     if quiet:
         return

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 MOST_SPECTRA = 1e16
 
 
-def question_values(study: Study, *, detects: bool, draws: bool, insist: bool) -> None:
+def check_question(study: Study, *, detects: bool, draws: bool, insist: bool) -> None:
     """Raise InputError for values that a later step would reject, or that would keep a hundred cores busy for a year.
 
     A verb that `detects` needs flares and thresholds; `insist` lets one that `draws` take any time.
@@ -74,7 +74,7 @@ def question_values(study: Study, *, detects: bool, draws: bool, insist: bool) -
         )
 
 
-def question_room(store: Store, *, insist: bool) -> None:
+def check_room(store: Store, *, insist: bool) -> None:
     """Raise InputError, with the required and the available space, for a store that does not fit on its disk."""
     if insist:
         return
@@ -213,7 +213,7 @@ class Session(flags.Options):
             return f"{names} {place}, and the same command{flag} writes all of them"
 
         with report_interrupts(written):
-            self._leave_all(answer)
+            self._write_all(answer)
         # A note on sampled thresholds is left out where the answer has its own.
         repeated = of_kind(self.notes, "sampled") if of_kind(answer.messages, "sampled") else []
         notes = [note for note in self.notes if note not in repeated]
@@ -232,7 +232,7 @@ class Session(flags.Options):
             names = ", ".join(path.name for path in self.files)
             self.say([f"Wrote {names} to {self.folder}/ in {time.perf_counter() - self.started:.1f} s."])
 
-    def _leave_all(self, answer: Answer) -> None:
+    def _write_all(self, answer: Answer) -> None:
         """Write tables, documents and pictures of an answer, its study and the run record; remove the checkpoint."""
         from mauvecl.answers.answer import write_record
         from mauvecl.charts.matplotlib import available
@@ -350,11 +350,11 @@ class Command:
                     raise InputError(fault, key=key)
                 flag_values[key] = [str(study_file)] if applies is flags.is_star else study_file
                 study_file = None
-        options = {name: values.pop(name, default) for name, (_, default) in self._options().items()}
+        options = {name: values.pop(name) for name in self._options()}
         read = None if study_file is None else Study.read(study_file)
         study, messages = self.verb.study_of(flag_values, keywords, read, "command line")
         detects = {"fap", "realisations"} <= keywords.keys()
-        question_values(study, detects=detects, draws=self.draws, insist=options.get("insist", False))
+        check_question(study, detects=detects, draws=self.draws, insist=options.get("insist", False))
         with ExitStack() as resources:
             session = Session(self.verb.name, study, flag_values, resources, self.draws, messages, **options)
             try:
@@ -398,17 +398,17 @@ def realise(session: Session) -> None:
     if not one_file and place.suffix not in ("", ".zarr"):
         raise InputError.of("output", str(place), f"a name ending in .zarr, {', '.join(bulk.ENDINGS)}")
     folder = bulk.unfinished(place) if one_file else place
-    question_room(Store(folder, session.study), insist=session.insist)
+    check_room(Store(folder, session.study), insist=session.insist)
     with (
         report_interrupts(lambda: f"what was written to {str(folder)!r} is kept, and --resume draws the rest"),
         session.pool("spectra") as (pool, meter),
     ):
         draw = bulk.realise_file if one_file else bulk.realise
         store = draw(session.study, place, pool, resume=session.resume, restart=session.restart, progress=meter)
-    _tell(store, place, session)
+    _show_store(store, place, session)
 
 
-def _tell(store: Store, place: Path, session: Session) -> None:
+def _show_store(store: Store, place: Path, session: Session) -> None:
     """Print what a written store holds, as text or as JSON."""
     from mauvecl.runs.store import ARRAY_COLUMNS
     from mauvecl.study.cases import assumptions_of, collect_messages

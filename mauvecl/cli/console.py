@@ -55,9 +55,9 @@ PRINTERS = ("click", "typer", "rich", "mauvecl.cli")  # libraries that write to 
 LONGEST = 1000  # largest number of characters of a message
 WIDEST = 100_000  # largest width of a table in a pipe or file, characters
 PATIENCE_S = 2.0  # duration of work below which no progress is shown
-CLEARED = "\r\x1b[K"  # text that clears the line of a terminal
+CLEAR_LINE = "\r\x1b[K"  # text that clears the line of a terminal
 #: Fraction of the work after which the remaining time is estimated, since the first tile's rate is unreliable.
-TOLD_FROM = 0.01
+ESTIMATED_FROM = 0.01
 #: Units of the remaining time, s; smaller times than three of them are in the next one.
 UNITS = (("days", 86_400.0), ("hours", 3600.0), ("min", 60.0))
 _app: typer.Typer | None = None  # the running command line, whose flags messages name
@@ -219,7 +219,7 @@ class Meter:
     def __exit__(self, *_: object) -> None:
         """Clear the line."""
         if self._changes and self._shown > self._started:
-            print(CLEARED, end="", file=sys.stderr, flush=True)
+            print(CLEAR_LINE, end="", file=sys.stderr, flush=True)
 
     def __call__(self, done: int, total: int) -> None:
         """Record how much work is done, in the meter's unit."""
@@ -239,13 +239,13 @@ class Meter:
         # Parts from a checkpoint took no time.
         counted = done - (standing.resumed if standing is not None and self._unit == "realisations" else 0)
         rate = counted / max(now - self._started, 1e-9)
-        if counted >= TOLD_FROM * total:
+        if counted >= ESTIMATED_FROM * total:
             seconds = (total - done) / rate
             unit, size = next((row for row in UNITS if seconds > 3 * row[1]), ("s", 1.0))
             time_left = f"{seconds / size:.0f} {unit} left"
         retries = f", {standing.retries} parts counted again" if standing is not None and standing.retries else ""
         line = f"{done} of {total} {self._unit}, {rate:.3g} a second, {time_left}{retries}"
-        print(*((CLEARED, line) if self._changes else (line, "\n")), sep="", end="", file=sys.stderr, flush=True)
+        print(*((CLEAR_LINE, line) if self._changes else (line, "\n")), sep="", end="", file=sys.stderr, flush=True)
 
 
 def _console(**options: Any) -> Console:
@@ -322,10 +322,11 @@ def _divided(columns: list[list[str]], room: int) -> list[list[list[str]]]:
     """Divide a table: each part has the first columns, which identify rows, and as many others as fit."""
     if _width(columns) <= room:
         return [columns]
-    # As few as needed, so that the first months are not repeated in each part.
+    # Each part repeats the first columns: as few as tell all rows apart, at most three, within half of the room.
     n_lines = len(columns[0])
     apart = next((n for n in (1, 2, 3) if len(set(zip(*columns[:n], strict=True))) == n_lines), 3)
     first = columns[: next((n for n in range(apart, 1, -1) if _width(columns[:n]) <= room / 2), 1)]
+    # The column of an interval stays with that of its value.
     groups: list[list[list[str]]] = []
     for column in columns[len(first) :]:
         if groups and column[0] == INTERVAL:

@@ -118,7 +118,7 @@ def missing_package(package: str, purpose: str, extra: str) -> InputError:
 
 
 def together(errors: Sequence[InputError]) -> InputError:
-    """Return one error for several wrong values, or the only one of them."""
+    """Join the errors of several wrong values in one, with them as its `parts`; a single error is returned as it is."""
     if len(errors) == 1:
         return errors[0]
     joint = InputError("; ".join(map(str, errors)), key=errors[0].key)

@@ -16,7 +16,7 @@ import math
 import operator
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin
 
@@ -163,7 +163,11 @@ class Unit:
         return WRITTEN.get(self.name, self.name)
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return or_error(handler(source), word_of(self.name), before=self.plain, unit=self.name)
+        inner = handler(source)
+        # The range of a type such as `Positive`, to which an annotation adds the unit.
+        inner_range: Range | None = (inner.get("metadata") or {}).get("range")
+        words = word_of(self.name) if inner_range is None else inner_range.words(self.name)
+        return or_error(inner, words, before=self.plain, unit=self.name)
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
         return _or_text(handler(schema))
@@ -196,7 +200,8 @@ class Range:
         unit = (inner.get("metadata") or {}).get("unit", "")
         words = self.words(unit, whole=int in (source, *get_args(source)))
         # A number without a unit may be written in per cent.
-        return or_error(inner, words, before=None if unit else Unit("").plain, after=self._check, unit=unit)
+        before = None if unit else Unit("").plain
+        return or_error(inner, words, before=before, after=self._check, unit=unit, range=self)
 
     def __contains__(self, value: Any) -> bool:
         if not math.isfinite(value) or not self.low <= value <= self.high:
@@ -300,7 +305,7 @@ def _or_text(schema: dict[str, Any]) -> dict[str, Any]:
 
 
 def or_error(
-    schema: CoreSchema, words: str, *, before: Convert | None = None, after: Convert | None = None, **metadata: str
+    schema: CoreSchema, words: str, *, before: Convert | None = None, after: Convert | None = None, **metadata: Any
 ) -> CoreSchema:
     """Replace every error of a schema, and of functions of the value before and after it, by the accepted values."""
     from pydantic_core import core_schema
@@ -361,6 +366,11 @@ class Flag:
         """Name of the parameter that receives the flag's value."""
         return self.names[0].partition("/")[0].lstrip("-").replace("-", "_")
 
+    @property
+    def label(self) -> str:
+        """Label of the page's field, as in "False alarms"."""
+        return self.parameter.replace("_", " ").capitalize()
+
 
 @dataclass(frozen=True)
 class Quantity:
@@ -393,11 +403,10 @@ class Slider:
 class Widget:
     """Field of the page that sets a key."""
 
-    label: str = field(default="", kw_only=False)  # text of the key's help by default
-    hint: str = field(default="", kw_only=False)  # explanation for visitors, in sentences
-    group: str = ""  # heading of the field's group; by default that of its section, if fields do not show at once
+    label: str = ""  # words of the key's flag by default
+    hint: str = ""  # explanation for visitors, in sentences
     place: int = 0  # order within the group; fields of the same place follow the order of the study
-    name: str = ""  # name in links; that of the key by default
+    name: str = ""  # name in links; by default that of the key, with its section before it if its flag has it there
     first: str | None = None  # text of a new page; the default of the key by default
     choices: tuple[str, ...] = ()  # accepted words; those of the key by default
     unit: str | None = None  # unit as the page shows it; that of the key by default
@@ -503,6 +512,7 @@ DateText = Annotated[str, Date()]
 #: Moment, from the start of an observation, and length of time.
 Moment = Annotated[float, Unit("s"), Range()]
 Duration = Annotated[float, Unit("s"), Range(0, open_low=True)]
+Days = Annotated[float, Unit("d"), Range(0, open_low=True)]
 #: Energy of a flare.
 Energy = Annotated[float, Unit("erg"), Range(0, open_low=True)]
 #: Seed of a random generator with 64 bits.

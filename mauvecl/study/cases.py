@@ -48,28 +48,31 @@ def assumptions_of(study: Study, uses: Collection[Use], varied: Collection[str] 
 
     The answer varies the quantities `varied` in addition to those of the sweep, if it uses that.
     """
-    axes = study.sweep.axes
+    axes, clauses = study.sweep.axes, []
     swept = {axis.quantity for axis in axes if "sweep" in uses} | set(varied)
-    orbit, limits = study.orbit.tle, study.orbit.limits
-    angles = {"Earth's limb": limits.earth_limb_deg, "Sun": limits.sun_deg, "Moon": limits.moon_deg}
-    least = ", ".join(f"{name} {value:g} deg" for name, value in angles.items() if value is not None)
-    words: dict[str, Callable[[], str]] = {
-        "instrument": lambda: _instrument(study, swept, uses),
-        "sky": lambda: "sky as swept" if "sky" in swept else study.sky.describe(),
-        "flare": lambda: _flare(study, swept, uses),
-        "orbit": lambda: f"orbit of {orbit.name if orbit else 'embedded elements'}; least angles: {least or 'none'}",
-        "unknowns": lambda: _unknowns(study, uses),
-        "templates": lambda: f"flares of the shape {study.search.shape}; noise as measured",
-        "seed": lambda: f"seed {study.run.seed}",
-    }
-    parts: set[str] = {*uses, "unknowns"} if {*UNKNOWN_USES} & {*uses} else {*uses}
-    # Verbs of an orbit look at targets, not at the study's star.
-    observes = "instrument" in uses and "orbit" not in uses
+    if "instrument" in uses:
+        clauses.append(_instrument(study, swept, uses))
+    if "sky" in uses:
+        clauses.append("sky as swept" if "sky" in swept else study.sky.describe())
+    if "flare" in uses:
+        clauses.append(_flare(study, swept, uses))
+    if "orbit" in uses:
+        elements, limits = study.orbit.tle, study.orbit.limits
+        angles = {"Earth's limb": limits.earth_limb_deg, "Sun": limits.sun_deg, "Moon": limits.moon_deg}
+        least = ", ".join(f"{name} {value:g} deg" for name, value in angles.items() if value is not None) or "none"
+        clauses.append(f"orbit of {elements.name if elements else 'embedded elements'}; least angles: {least}")
+    if {*UNKNOWN_USES} & {*uses}:
+        clauses.append(_unknowns(study, uses))
+    if "templates" in uses:
+        clauses.append(f"flares of the shape {study.search.shape}; noise as measured")
+    if "seed" in uses:
+        clauses.append(f"seed {study.run.seed}")
     unused = [key for use, keys in _given_unknowns(study).items() if use not in uses for key in keys]
     unused += ["sweep.axes"] if axes and "sweep" not in uses else []
-    unused += [] if observes or all(star.neighbours is None for star in study.star) else ["star.neighbours"]
-    ignored = [f"not used: {', '.join(unused)}"] if unused else []
-    return [*(clause() for part, clause in words.items() if part in parts), *ignored]
+    # Verbs of an orbit look at targets, not at the study's star.
+    observes = "instrument" in uses and "orbit" not in uses
+    unused += ["star.neighbours"] if not observes and any(star.neighbours for star in study.star) else []
+    return [*clauses, f"not used: {', '.join(unused)}"] if unused else clauses
 
 
 def _instrument(study: Study, swept: set[str], uses: Collection[str]) -> str:
@@ -84,7 +87,7 @@ def _instrument(study: Study, swept: set[str], uses: Collection[str]) -> str:
         return f"{text}, detector temperature along the orbit"
     if "orbit" not in uses and "stare" in uses and study.stare.along_orbit:
         return f"{text}, detector temperature of the stare along the orbit"
-    return f"{text}, detector at {study.observation.load_instrument().temperature_c:g} deg C"
+    return f"{text}, detector at {o.load_instrument().temperature_c:g} deg C"
 
 
 def _flare(study: Study, swept: set[str], uses: Collection[str]) -> str:
@@ -434,9 +437,27 @@ class Case:
                 events[n] = replace(event, amplitude=choice.energy_erg / energy)
         return events
 
+    def energy_scale(self, kind: Kind, temperature_k: float | None = None) -> EnergyScale | None:
+        """Return the energy of flares per second of equivalent duration, by default at the study's temperature.
+
+        It follows from the star's distance or else from its radius and temperature; None if neither is known.
+        """
+        from mauvecl.flares.energies import EnergyScale
+
+        star, flare = self.star, self.study.flare
+        options: dict[str, Any] = {
+            "band": flare.band, "flare": flare.light(temperature_k), "kind": kind, "geometry": flare.geometry,
+            "photosphere_k": flare.photosphere_temperature_k,
+        }  # fmt: skip
+        if star.distance_pc is not None:
+            return EnergyScale.of_star(self.source, star.distance_pc, **options)
+        if star.radius_rsun is not None and star.effective_temperature_k is not None:
+            return EnergyScale.of_blackbody(star.radius_rsun, star.effective_temperature_k, **options)
+        return None
+
     def energy(self, event: Event, kind: Kind, temperatures_k: NDArray[np.float64] | None = None) -> float:
         """Return the energy of a flare, erg, as `Event.total_energy`; NaN if the star's size is unknown."""
-        scale_of = partial(self.study.flare.energy_scale, self.star, self.source, kind)
+        scale_of = partial(self.energy_scale, kind)
         if scale_of(event.hottest_k) is None:
             return float("nan")
         return event.total_energy(cast("Callable[[float], EnergyScale]", scale_of), temperatures_k)
@@ -493,7 +514,7 @@ def collect_messages(expectations: list[Expectation], processes: Processes | Non
 
 
 def _star_of(x: Expectation) -> tuple[tuple[object, ...], bool]:
-    """Return what tells an expectation's star and exposure from others, and whether it has a flare."""
+    """Return a key of an expectation's star and exposure, the same with and without a flare, and whether it has one."""
     steps = [step for step in x.provenance.get("source history", "").split("; ") if step]
     quiet = tuple(step for step in steps if not step.startswith("flare"))
     return (x.name, quiet, x.frame_s, x.n_frames), len(quiet) < len(steps)

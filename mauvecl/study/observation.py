@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, create_model, model_validator
 
-from mauvecl.detection import DEFAULT_STATISTICS, RECOMMENDED, STATISTIC_NAMES
+from mauvecl.detection import DEFAULT_STATISTICS, RECOMMENDED, STATISTIC_NAMES, Tails
 from mauvecl.host.exposure import DEFAULT_SKY
 from mauvecl.host.instrument import DEFAULT_INSTRUMENT, FORMERLY_MAUVE, current_name, shipped_names
 from mauvecl.noise.disturbances import Prior, PriorField
@@ -43,7 +43,6 @@ class Observation(Section):
         50.0,
         "Exposure time; rounded up to whole frames of 5 s",
         flag="--exposure -t",
-        label="Exposure",
         hint="Time on the star; whole frames of 5 s are added up.",
         slider=Slider(5, 3600, 5),
         quantity=("exposure", "length of the exposure", "exposure (s)"),
@@ -63,8 +62,8 @@ class Observation(Section):
         "Detector temperature",
         flag="--temperature",
         usual="the instrument's",
+        label="Detector temperature",
         hint="The dark current doubles every few degrees.",
-        group="Detector",
         placeholder="21, or along the orbit in plans",
         slider=Slider(-10, 40, 1),
         quantity=("detector_temperature", "temperature of the detector", "detector temperature (deg C)"),
@@ -78,7 +77,6 @@ class Observation(Section):
         label="Counted as signal",
         hint="In the S/N: the light of the star alone (net), or that of the sky too, as in the MauveSim paper. It "
         "moves no detection.",
-        group="Sky",
         place=2,
     )
     mode: Literal["auto", "frames", "stacked"] = setting("auto", "How the frames of an exposure are drawn")
@@ -195,7 +193,7 @@ class Run(Section):
         unit="per test",
         slider=Slider(1e-6, 0.1, 10**0.1, log=True),
     )
-    tails: Literal["counted", "sampled"] = setting(
+    tails: Tails = setting(
         "counted",
         "Thresholds with fewer than 100 draws beyond them",
         flag="--tails",

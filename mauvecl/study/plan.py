@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import field_validator, model_validator
 
-from mauvecl.host.orbit import Limits
+from mauvecl.host.orbit import Limits, OrbitKind
 from mauvecl.host.tables import names
 from mauvecl.schema import fields
 from mauvecl.schema.errors import InputError, shortened, shown
@@ -41,18 +41,17 @@ class OrbitQuestion(Section):
         hint="The first day of the time that is looked at, UTC.",
         kind="day",
     )
-    days: Annotated[float, Unit("d"), Range(0, open_low=True)] = setting(
+    days: fields.Days = setting(
         365.0,
         "Length of time",
         flag="--days",
-        label="Days",
         hint="How many days from the first one on are looked at: 365 show every season.",
         most=1000,
         slider=Slider(5, 730, 5),
     )
     step_s: fields.Duration = setting(60.0, "Time between the computed positions", flag="--step")
     tle: Path | None = setting(None, "File of two-line elements, newer than the embedded ones", flag="--tle")
-    kind: Literal["auto", "tle", "mean"] = setting(
+    kind: OrbitKind = setting(
         "auto", "Model of the orbit", flag="--orbit", choices="tle, mean, or auto (mean far from the elements' epoch)"
     )
     targets: tuple[str, ...] = setting((), "Name of a target, or coordinates such as '290.0 -11.2'", flag="--look-at")

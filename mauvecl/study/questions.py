@@ -122,7 +122,6 @@ class LimitQuestion(Section):
         flag="--power",
         label="Wanted probability",
         hint="With which a flare is to be detected at the limit.",
-        group="Detection",
         slider=Slider(0.5, 0.99, 0.01),
     )
 
@@ -175,13 +174,14 @@ class Axis(Section):
         if self.values is not None:
             return self.values
         start, stop, steps = cast("tuple[float, float, int]", (self.start, self.stop, self.steps))
-        share = [i / (steps - 1) for i in range(steps)]
+        # The last value is exact, since rounding could put it out of the quantity's range.
+        shares = [i / (steps - 1) for i in range(steps - 1)]
         if not self.log:
-            return tuple(start + (stop - start) * s for s in share)
+            return (*(start + (stop - start) * share for share in shares), stop)
         if min(start, stop) <= 0:
             fault = f"the logarithmic axis {self.quantity!r} needs values above 0, but runs from {start:g} to {stop:g}"
             raise InputError(fault, key="start")
-        return tuple(start * (stop / start) ** s for s in share)
+        return (*(start * (stop / start) ** share for share in shares), stop)
 
 
 class MapQuestion(Section):
@@ -341,7 +341,6 @@ class CalibrateQuestion(Section):
 DEFAULT_CHANGES = ("Mg II", "Ca II", "H beta", "H alpha", "balmer jump", "200-320", "320-700", "colour")
 #: Name of the change that adds the light of `change.file`.
 SPECTRUM = "spectrum"
-Days = Annotated[fields.Positive, Unit("d")]
 
 
 class ChangeQuestion(Section):
@@ -365,7 +364,6 @@ class ChangeQuestion(Section):
         flag="--change-file",
         label="Added spectrum",
         hint="Light that a change adds to the star, such as an accretion excess or a companion: the change “spectrum”.",
-        name="change_file",
         place=1,
         kind="file",
     )
@@ -376,11 +374,9 @@ class ChangeQuestion(Section):
         choices=tuple(ALIASES),
         label="Band of the added light",
         hint="The smallest change is the light of the added spectrum in this band over that of the star.",
-        group="Added spectrum",
-        name="change_band",
     )
-    wavelength_unit: str | None = unit_of_file("wavelength", "change", "that spectrum", "Added", "Added spectrum")
-    flux_unit: str | None = unit_of_file("flux", "change", "that spectrum", "Added", "Added spectrum")
+    wavelength_unit: str | None = unit_of_file("wavelength", "change", "that spectrum", "Added")
+    flux_unit: str | None = unit_of_file("flux", "change", "that spectrum", "Added")
     extend: str | None = setting(
         None,
         "Library spectrum that continues that spectrum beyond its end",
@@ -388,15 +384,12 @@ class ChangeQuestion(Section):
         label="Added: continue with",
         hint="Library spectrum that continues the added one beyond its end, such as M3V, scaled to match at the "
         "join. Nothing: it must cover what the instrument sees.",
-        group="Added spectrum",
-        name="change_extend",
         kind="library",
     )
     visits: Annotated[int, Range(2, 10_000)] = setting(
         2,
         "Visits that are compared",
         flag="--visits",
-        label="Visits",
         hint="How many exposures of the star are compared with each other.",
         first="20",
         slider=Slider(2, 100, 1),
@@ -404,14 +397,14 @@ class ChangeQuestion(Section):
     periods: bool = setting(
         False, "Map which periods are recovered, from visits to the first target of the orbit", flag="--periods"
     )
-    shortest_d: Days = setting(
+    shortest_d: fields.Days = setting(
         1.0,
         "Shortest period",
         flag="--shortest-period",
         hint="The first period of the map.",
         slider=Slider(0.1, 10, 1.1, log=True),
     )
-    longest_d: Days = setting(
+    longest_d: fields.Days = setting(
         30.0,
         "Longest period",
         flag="--longest-period",
@@ -462,7 +455,6 @@ class DataChoice(Section):
         None,
         "Where time, flux and error are in that file (TOML)",
         flag="--mapping",
-        label="Mapping",
         hint="Other files need a short TOML file that names the columns of time, flux and error, such as "
         "time = 'TIME', flux = 'RATE'; the documentation has one for each layout.",
         kind="upload",
@@ -472,7 +464,6 @@ class DataChoice(Section):
         "Bits of the quality flag that exclude a frame; numbers and names as in 'Desat,128', or all, or none",
         flag="--quality-bits",
         usual="lightkurve's default for Kepler and K2, for TESS without ImpulsiveOutlier, else all",
-        label="Quality bits",
         hint="Bits of the quality flag that exclude a frame: numbers and names as in Desat,128, or all, or none. "
         "Without them lightkurve's default applies to Kepler and K2, its default without ImpulsiveOutlier to TESS, "
         "and all bits to other files.",
@@ -528,7 +519,6 @@ class MeasureQuestion(Section):
         False,
         "Fit shape, temperature and, if it falls, cooling of the flare to all frames of the study's stare together",
         flag="--joint-fit",
-        label="Joint fit",
         hint="Simulated fits then also fit shape and spectrum of the flare to all frames of a stare of one orbit "
         "together: its peak, half-width, amplitude and temperature.",
     )

@@ -17,7 +17,6 @@ from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit
 from mauvecl.schema.section import Section, check_all, check_needs, check_one, read_line_fluxes, setting
 
 if TYPE_CHECKING:
-    from mauvecl.flares.energies import EnergyScale, Kind
     from mauvecl.host.exposure.background import Neighbours
     from mauvecl.host.stars.flare import FlareSpectrum
     from mauvecl.host.stars.source import Source
@@ -35,17 +34,18 @@ STAR_KEYS = (
 )  # fmt: skip
 
 
-def unit_of_file(of: Literal["wavelength", "flux"], prefix: str, whose: str, label: str, group: str) -> Any:
-    """Return the field of a unit of spectra next to a star's; `prefix` begins its flag, `whose` ends its help."""
-    noun, examples, units = UNITS[of]
+def unit_of_file(quantity: Literal["wavelength", "flux"], prefix: str, whose: str, label: str) -> Any:
+    """Return the field of the unit of a spectrum other than the star's.
+
+    Its flag begins with `prefix` and its label on the page with `label`; `whose` names the spectrum in its help.
+    """
+    noun, examples, units = UNITS[quantity]
     return setting(
         None,
         f"Unit of the {noun} of {whose}",
-        flag=f"--{prefix}-{of}-unit",
+        flag=f"--{prefix}-{quantity}-unit",
         label=f"{label}: unit of {noun}",
         hint=f"Such as {examples}. Nothing: what the file says.",
-        group=group,
-        name=f"{prefix}_{of}_unit",
         suggestions=units,
     )
 
@@ -83,7 +83,6 @@ class Star(Section):
         "Band of the magnitude",
         flag="--band",
         choices=tuple(ALIASES),
-        label="Band",
         hint="The band of the magnitude. In V, Vega has 0.03, as in catalogues.",
     )
     magnitude_system: Literal["catalogue", "vega", "ab"] = setting(
@@ -99,7 +98,6 @@ class Star(Section):
         label="Reddening",
         hint="Dust in front of the star, E(B-V) in magnitudes. The magnitude above is that of the reddened star. "
         "Nothing: no dust.",
-        group="Star",
     )
     wavelength_unit: str | None = setting(
         None,
@@ -107,7 +105,6 @@ class Star(Section):
         flag="--wavelength-unit",
         label="Unit of wavelengths",
         hint="That of the file's wavelengths, such as Angstrom or Angstrom air. Nothing: what the file says.",
-        group="Own spectrum",
         suggestions=("nm", "Angstrom", "um", "nm air", "Angstrom air", "Hz", "eV"),
     )
     flux_unit: str | None = setting(
@@ -116,7 +113,6 @@ class Star(Section):
         flag="--flux-unit",
         label="Unit of fluxes",
         hint="That of the file's fluxes, such as W m-2 nm-1 or Jy. Nothing: what the file says.",
-        group="Own spectrum",
         suggestions=("erg s-1 cm-2 Angstrom-1", "W m-2 nm-1", "W m-2 um-1", "Jy", "photon s-1 cm-2 Angstrom-1"),
     )
     extend: str | None = setting(
@@ -125,7 +121,6 @@ class Star(Section):
         flag="--extend",
         label="Continue with",
         hint="Library spectrum that continues the file beyond its ends, scaled to it, such as G2V. Nothing: none.",
-        group="Own spectrum",
         kind="library",
     )
     ignore_checksum: bool | None = setting(
@@ -136,9 +131,7 @@ class Star(Section):
         None,
         "Distance of the star; for energies",
         flag="--distance",
-        label="Distance",
         hint="With it, measured flares have luminosities and energies. Nothing: fluxes at the telescope alone.",
-        group="Measurement",
     )
     radius_rsun: fields.Radius | None = setting(None, "Radius of the star; for energies", flag="--radius")
     effective_temperature_k: fields.Temperature | None = setting(
@@ -148,10 +141,8 @@ class Star(Section):
         None,
         "Table of other stars near the star; with separation, magnitude and spectral type, or of a Gaia query",
         flag="--neighbours",
-        label="Neighbours",
         hint="Other stars near the star, as CSV: name, separation (arcsec), magnitude and spectral_type, or the "
         "columns of a Gaia query. The light of those within 47 arcsec enters.",
-        group="Neighbours",
         kind="table",
         placeholder="name,separation,magnitude,spectral_type",
     )
@@ -162,7 +153,6 @@ class Star(Section):
         label="The star itself",
         hint="Its own row in that table, by name, or its coordinates, such as 290.68 +11.12; needed if the table "
         "has positions but no separations.",
-        group="Neighbours",
     )
     neighbour_share: fields.Share = setting(
         1.0,
@@ -171,7 +161,6 @@ class Star(Section):
         label="Share that enters",
         hint="Share of the light of neighbours within 47 arcsec that enters the fibre; an assumption, since it is "
         "not published.",
-        group="Neighbours",
     )
 
     @model_validator(mode="before")
@@ -193,8 +182,9 @@ class Star(Section):
         changed = super().with_value(path, value)
         if path[0] != "library":
             return changed
-        here, listed = (_listed(name, self.band, self.magnitude_system) for name in (self.library or "", str(value)))
-        if self.magnitude not in (None, here.get("magnitude")):
+        before = _listed(self.library or "", self.band, self.magnitude_system)
+        listed = _listed(str(value), self.band, self.magnitude_system)
+        if self.magnitude not in (None, before.get("magnitude")):
             # A magnitude that is not from the list was set by the user, for every star.
             listed.pop("magnitude", None)
         return changed.model_copy(update=dict.fromkeys(STAR_KEYS) | listed)
@@ -250,7 +240,6 @@ class FlareLight(Section):
         "Ratio of the flare's flux just below the Balmer edge to that just above",
         flag="--balmer-jump",
         usual="1",
-        label="Balmer jump",
         hint="Flux just below 364.6 nm over that just above, by hydrogen recombination: 1 to 4 in most flares. "
         "Nothing: a plain blackbody.",
         quantity=(
@@ -264,7 +253,6 @@ class FlareLight(Section):
         None,
         "Temperature of a second blackbody of the flare; needs its area",
         flag="--second-temperature",
-        label="Second temperature",
         hint="A second blackbody in the flare, instead of a Balmer jump. Nothing: there is none.",
         quantity=("second_temperature", "temperature of the flare's second blackbody", "second temperature (K)"),
     )
@@ -272,7 +260,6 @@ class FlareLight(Section):
         None,
         "Area of the second blackbody over that of the first",
         flag="--second-area",
-        label="Second area",
         hint="Area at the second temperature over that at the first, if there is one.",
         first="0.05",
         quantity=("second_area", "area of the flare's second blackbody over that of the first", "second area"),
@@ -299,7 +286,6 @@ class FlareLight(Section):
         label="Own flare spectrum",
         hint="Spectrum of an observed or computed flare without its star, in place of a blackbody. The amplitude "
         "scales it.",
-        name="flare_file",
         place=2,
         kind="file",
     )
@@ -310,21 +296,17 @@ class FlareLight(Section):
         label="Star without the flare",
         hint="Spectrum of the same star without the flare, on the same scale and in the same units. It is "
         "subtracted. Nothing: the file holds the flare alone.",
-        group="Own flare",
-        name="flare_quiescent",
         place=1,
         kind="file",
     )
-    wavelength_unit: str | None = unit_of_file("wavelength", "flare", "the flare's files", "Flare", "Own flare")
-    flux_unit: str | None = unit_of_file("flux", "flare", "the flare's files", "Flare", "Own flare")
+    wavelength_unit: str | None = unit_of_file("wavelength", "flare", "the flare's files", "Flare")
+    flux_unit: str | None = unit_of_file("flux", "flare", "the flare's files", "Flare")
     continue_at_k: fields.Temperature | None = setting(
         None,
         "Temperature of a blackbody that continues the flare's file beyond its ends",
         flag="--continue-at",
-        label="Continue at",
         hint="Temperature of a blackbody that continues the flare's spectrum beyond its ends. Nothing: it must "
         "cover what the instrument sees.",
-        group="Own flare",
     )
     as_observed: bool = setting(
         False,
@@ -332,7 +314,6 @@ class FlareLight(Section):
         flag="--as-observed",
         label="As bright as observed",
         hint="Whether the flare has the flux of its file at the telescope, in place of the amplitude above.",
-        group="Own flare",
         place=2,
     )
 
@@ -399,6 +380,7 @@ class Flare(Section):
             ),
             Flag("--amplitude", "-a"),
         ),
+        label="Flare amplitude",
         hint="By how much the flare at its peak brightens the star in the band of the Kepler satellite. In the "
         "ultraviolet the rise is many times as large.",
         name="amplitude_percent",
@@ -412,8 +394,6 @@ class Flare(Section):
         "Flare temperature",
         flag="--flare-temperature",
         hint="The flare shines as a blackbody of this temperature. The hotter, the more of its light is ultraviolet.",
-        group="Flare's spectrum",
-        name="flare_temperature_k",
         slider=Slider(5000, 30_000, 500),
         quantity=("flare_temperature", "blackbody temperature of the flare", "flare temperature (K)"),
     )
@@ -439,25 +419,6 @@ class Flare(Section):
     def light(self, temperature_k: float | None = None) -> FlareSpectrum:
         """Return the spectrum of a flare, by default at the study's temperature."""
         return self.spectrum.at_temperature(self.temperature_k if temperature_k is None else temperature_k)
-
-    def energy_scale(
-        self, star: Star, source: Source, kind: Kind, temperature_k: float | None = None
-    ) -> EnergyScale | None:
-        """Return the energy of flares per second of equivalent duration, by default at the study's temperature.
-
-        It follows from the star's distance or else from its radius and temperature; None if neither is known.
-        """
-        from mauvecl.flares.energies import EnergyScale
-
-        flare: dict[str, Any] = {
-            "band": self.band, "flare": self.light(temperature_k), "kind": kind, "geometry": self.geometry,
-            "photosphere_k": self.photosphere_temperature_k,
-        }  # fmt: skip
-        if star.distance_pc is not None:
-            return EnergyScale.of_star(source, star.distance_pc, **flare)
-        if star.radius_rsun is not None and star.effective_temperature_k is not None:
-            return EnergyScale.of_blackbody(star.radius_rsun, star.effective_temperature_k, **flare)
-        return None
 
     @property
     def is_blackbody(self) -> bool:

@@ -183,7 +183,6 @@ class SearchChoice(Section):
         1.0,
         "False alarms of the search per star-day, star-month or star-year",
         flag="--false-alarms",
-        label="False alarms",
         hint="Expected number of detections that are only noise, in the time that the next field states.",
     )
     per: Per = setting(
@@ -221,11 +220,11 @@ class SearchChoice(Section):
         from mauvecl.flares.shapes import shape_of
         from mauvecl.search.search import Baseline, white_bank
 
-        level = Baseline(self.offset, self.slope, False, WINDOW_S if self.window_s is None else self.window_s)
-        return white_bank(self.half_widths_s, shape_of(self.shape), frame_s, level)
+        baseline = Baseline(self.offset, self.slope, False, WINDOW_S if self.window_s is None else self.window_s)
+        return white_bank(self.half_widths_s, shape_of(self.shape), frame_s, baseline)
 
-    def level(self, stare: Stare, orbit_s: float) -> Baseline:
-        """Return the baseline model for a stare."""
+    def baseline(self, stare: Stare, orbit_s: float) -> Baseline:
+        """Return the baseline of flares in a stare; a cycle is in it by default if the stare has an unknown one."""
         from mauvecl.search.search import Baseline
 
         cycle = self.cycle if self.cycle is not None else any("cosine" in u.name for u in stare.unknowns)

@@ -104,12 +104,14 @@ def locate_files(data: dict[str, Any], table: Path) -> None:
     """
     study = table.parent / "study.toml"
     for section in tables_in(data):
-        for key in [key for key, name in section.items() if f"{key}_sha256" in section and isinstance(name, str)]:
-            name, digest = Path(section[key]).name, section.pop(f"{key}_sha256")
+        for key, path in [*section.items()]:
+            if f"{key}_sha256" not in section or not isinstance(path, str):
+                continue
+            name, digest = Path(path).name, section.pop(f"{key}_sha256")
             text = files.read_text(study, "study file") if study.is_file() else ""
             tables = tables_in(files.toml(text, "study file 'study.toml'"))
-            texts = (text for keys in tables for text in keys.values() if isinstance(text, str))
-            named = (table.parent / text for text in texts if Path(text).name == name)
+            values = (value for keys in tables for value in keys.values() if isinstance(value, str))
+            named = (table.parent / value for value in values if Path(value).name == name)
             places = [table.parent / name, table.parent.parent / name, Path(name), *named]
             existing = (place for place in places if files.without_columns(place)[0].is_file())
             file = next((place for place in existing if _digest(place) == digest), None)
@@ -241,7 +243,7 @@ class Study(Section):
 
     def ideal(self) -> Self:
         """Return a copy without the usual unknowns."""
-        return self.model_copy(update={"nuisances": self.nuisances.model_copy(update={"usual": False})})
+        return self.with_value(("nuisances", "usual"), False)
 
     def paper(self) -> Self:
         """Return a copy with the conventions of the MauveSim paper.
@@ -249,10 +251,10 @@ class Study(Section):
         The dark charge is drawn in DN, everything but the noise is known, and sums of squares are statistics as well
         unless the study states its statistics.
         """
-        observation = self.observation.model_copy(update={"instrument": FORMERLY_MAUVE})
-        statistics = self.run.statistics if "statistics" in self.run.model_fields_set else DEFAULT_STATISTICS
-        run = self.run.model_copy(update={"statistics": statistics})
-        return self.ideal().model_copy(update={"observation": observation, "run": run})
+        study = self.ideal().with_value(("observation", "instrument"), FORMERLY_MAUVE)
+        if "statistics" in self.run.model_fields_set:
+            return study
+        return study.model_copy(update={"run": self.run.model_copy(update={"statistics": DEFAULT_STATISTICS})})
 
     def with_changes(
         self, changes: dict[str, dict[str, Any]], stars: list[dict[str, Any]] | None, where: str = "changes"

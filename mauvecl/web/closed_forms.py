@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -144,11 +145,11 @@ class InterpolatedForm:
         self._inverse = PchipInterpolator(-special.ndtri(beyond[inside]), at[inside], extrapolate=True)
 
     def sf(self, value: Float) -> Float:
-        """Return the probabilities of exceeding values."""
+        """Return the probability of exceeding each value, shape of `value`."""
         return np.asarray(special.ndtr(self._probit(value)))
 
     def isf(self, probability: Float) -> Float:
-        """Return the values that are exceeded with given probabilities."""
+        """Return the value that is exceeded with each probability, shape of `probability`."""
         return np.asarray(self._inverse(-special.ndtri(probability)))
 
 
@@ -193,6 +194,11 @@ class ClosedForms:
         return float("nan") if self.flare.saturated[used].all() else self.odds.probability
 
     @property
+    def study(self) -> Study:
+        """The question as a study."""
+        return self.case.study
+
+    @property
     def quiet(self) -> Expectation:
         """Expectation of the star without the flare."""
         return self.case.quiet
@@ -210,7 +216,7 @@ class ClosedForms:
         changes: dict[str, dict[str, Any]] = {"nuisances": {"usual": unknown == REALISTIC}}
         if question["instrument"] != self.question.instrument:
             changes["observation"] = {"instrument": question["instrument"]}
-        sections = {key: getattr(self.case.study, key).model_copy(update=keys) for key, keys in changes.items()}
+        sections = {key: getattr(self.study, key).model_copy(update=keys) for key, keys in changes.items()}
         case = self.case.with_sections(**sections)
         return ClosedForms(replace(self.question, values={**self.question.values, **question}), case)
 
@@ -222,22 +228,23 @@ class ClosedForms:
     @cached_property
     def messages(self) -> list[str]:
         """Messages for the visitor, the most severe first."""
-        nuisances = self.case.study.nuisances
-        cost = unknown_cost("this flare", self.quiet, self.flare, nuisances, self.case.study.run.comparison())
+        nuisances = self.study.nuisances
+        cost = unknown_cost("this flare", self.quiet, self.flare, nuisances, self.study.run.comparison())
         return [*collect_messages([self.quiet, self.flare]), *unknown_lines([cost], nuisances)]
 
     @property
     def words(self) -> str:
         """Question in words, as part of a sentence."""
-        q, x, light = self.question, self.quiet, self.case.study.flare.light().describe()
+        q, x, light = self.question, self.quiet, self.study.flare.light().describe()
         frames = "one frame" if x.n_frames == 1 else f"{x.n_frames} frames"
         star = f"{q.star_in_words} of {q.band} = {q.magnitude:g}"
         return f"a {q.amplitude_percent:g} % flare ({light}) on {star}, in {x.exposure_s:g} s ({frames})"
 
     def at(self, light: float, rises: Float, *, others: bool = False) -> list[DetectionForms]:
-        """Return the closed forms for factors on the light, with `others` all light's, and on the amplitude, (n_rise,).
+        """Return the closed forms for a brighter or fainter star and for flares of other amplitudes.
 
-        The list is empty if the star saturates every pixel.
+        `light` is a factor on the star's light, and if `others` on that of sky and neighbours as well; `rises`, shape
+        (n_rise,), are factors on the flare's amplitude. The list is empty if the star saturates every pixel.
         """
         q, base = self.question, self.quiet
         statistic, rise = STATISTICS[q.statistic], self.flare.source_electrons - base.source_electrons
@@ -276,30 +283,35 @@ def chances(closed: ClosedForms, answers: Answers) -> list[Chance]:
     for unknown in UNKNOWN:
         try:
             assumed = closed.assuming(unknown)
-            answer: DetectAnswer | None = answers.get("detection" if assumed is closed else OTHER)
-            if answer is not None:
-                (row,) = (row for row in answer.table if row["statistic"] == closed.question.statistic)
-                value, count = float(row["probability"]), closed.question.realisations[0]
-                origin = f"{chance_range(row['low'], row['high'])}, of {count:,} simulated"
-            else:
-                value, origin = assumed.chance, "in closed form"
-                if not (assumed.case.study.nuisances.usual or assumed.slow or value != value):
-                    # This takes no time.
-                    lights = (1 - THROUGHPUT, 1 + THROUGHPUT)
-                    ends = [odds.probability for light in lights for odds in assumed.at(light, np.ones(1), others=True)]
-                    percent = f"{100 * THROUGHPUT:g} %"
-                    origin += f"; {chance_range(min(ends), max(ends))} if the throughput is {percent} lower or higher"
+            chance = _chance(assumed, answers.get("detection" if assumed is closed else OTHER))
         except InputError as error:
             if unknown == closed.question.unknown:
                 raise
-            value, origin = float("nan"), sentence(error)
-        all_chances.append(Chance(unknown, value, origin))
+            chance = Chance(unknown, float("nan"), sentence(error))
+        all_chances.append(chance)
     return all_chances
+
+
+def _chance(assumed: ClosedForms, answer: DetectAnswer | None) -> Chance:
+    """Return the chance under one assumption, in closed form unless there is a simulated answer."""
+    q = assumed.question
+    if answer is not None:
+        (row,) = (row for row in answer.table if row["statistic"] == q.statistic)
+        interval = chance_range(row["low"], row["high"])
+        return Chance(q.unknown, float(row["probability"]), f"{interval}, of {q.realisations[0]:,} simulated")
+    chance = Chance(q.unknown, assumed.chance, "in closed form")
+    if q.unknown == REALISTIC or assumed.slow or math.isnan(chance.value):
+        return chance
+    # Other throughputs take no time.
+    lights = (1 - THROUGHPUT, 1 + THROUGHPUT)
+    ends = [odds.probability for light in lights for odds in assumed.at(light, np.ones(1), others=True)]
+    interval = f"{chance_range(min(ends), max(ends))} if the throughput is {100 * THROUGHPUT:g} % lower or higher"
+    return chance._replace(origin=f"{chance.origin}; {interval}")
 
 
 def solved(closed: ClosedForms) -> str:
     """Return a sentence on the limit of the quantity that the question solves for, with and without unknowns."""
-    q, limit = closed.question, closed.case.study.limit
+    q, limit = closed.question, closed.study.limit
     before, in_words, without_limit, by_simulation = LIMITS[limit.of]
     clauses: dict[str, str] = {}
     near: float | None = None

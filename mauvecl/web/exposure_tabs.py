@@ -1,11 +1,16 @@
-"""Tabs of exposures: spectra, signals, noise, detection of the flare, and unknowns of the instrument."""
+"""Tabs of exposures: spectra, signals, noise, detection of the flare and its limits, and unknowns of the instrument."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+from bokeh.models import FixedTicker, HoverTool, LinearColorMapper
+from contourpy import contour_generator
+from scipy import special
+from scipy.interpolate import PchipInterpolator
 
 from mauvecl.answers.closed_forms import UNKNOWN_COLUMNS as COLUMNS
 from mauvecl.answers.closed_forms import Cost, power, spoken, unknown_cost
@@ -14,28 +19,31 @@ from mauvecl.charts import chart
 from mauvecl.charts.chart import WAVELENGTH, Area, Bars, Chart, ChartData, Dots, Line, OwnMarker, PlotAxis, Rule
 from mauvecl.charts.detection import BUDGET, budget_series, roc_columns
 from mauvecl.detection.requests import statistic_label
+from mauvecl.host.arrays import Float
 from mauvecl.noise.unknowns import NUISANCES
 from mauvecl.schema.columns import View, chance_text, stacked, with_error
-from mauvecl.study.cases import star_column, star_label
+from mauvecl.study.cases import star_column
 from mauvecl.study.observation import NuisanceChoice
-from mauvecl.web.closed_forms import Answers, short
-from mauvecl.web.figures import SATURATED, strips
-from mauvecl.web.tab import Tab
+from mauvecl.web.closed_forms import LIMITS, Answers, short
+from mauvecl.web.tab import SATURATED, Tab, strips
+from mauvecl.web.uploads import RESULTS
 
 if TYPE_CHECKING:
     from bokeh.models.sources import ColumnDataSource
 
     from mauvecl.web.closed_forms import ClosedForms
-    from mauvecl.web.figures import Canvas
+    from mauvecl.web.tab import Canvas
+
+T = TypeVar("T")
 
 
 @BUDGET.data()
 def budget(closed: ClosedForms, answers: Answers) -> ChartData:
     """Return the noise of a pixel by origin."""
     series = budget_series(closed.quiet)
-    power = {line: float(np.nansum(series[line.key][1] ** 2)) for line in BUDGET.series[1:] if line.key in series}
-    largest = max(power, key=lambda line: power[line])
-    share = 100 * power[largest] / (sum(power.values()) or 1.0)
+    powers = {line: float(np.nansum(series[line.key][1] ** 2)) for line in BUDGET.series[1:] if line.key in series}
+    largest = max(powers, key=lambda line: powers[line])
+    share = 100 * powers[largest] / (sum(powers.values()) or 1.0)
     return ChartData(f"Most of the noise's power comes from {largest.called}: {share:.0f} % over all pixels.", series)
 
 
@@ -49,9 +57,9 @@ NOISE = Tab(
     # The closed-form table of `mauvecl snr`.
     own_table=lambda closed, answers: stacked(
         [star_column()],
-        [({"star": star_label(closed.case.study.star[0], closed.quiet)}, closed.quiet.noise_budget())],
-        realisations=closed.case.study.run.realisations,
-        study=closed.case.study.ideal().text(),
+        [({"star": closed.case.label}, closed.quiet.noise_budget())],
+        realisations=closed.study.run.realisations,
+        study=closed.study.ideal().text(),
     ),
 )
 
@@ -169,7 +177,7 @@ SPECTRUM = Tab(
     questions=("simulate",),
     files={"observation": None},
     # One observation with the flare and its components.
-    own_table=lambda closed, answers: simulate(closed.case.study, flaring=True).observations[1][2],
+    own_table=lambda closed, answers: simulate(closed.study, flaring=True).observations[1][2],
 )
 
 
@@ -308,9 +316,9 @@ def costs(closed: ClosedForms) -> list[Cost]:
             choice = NuisanceChoice.model_validate({"usual": False, name: spread})
             choices[spoken(choice).removeprefix("the ")] = choice
     choices["all the usual together"] = NuisanceChoice()
-    if closed.case.study.nuisances.own:
-        choices["your own spectrum"] = NuisanceChoice(usual=False, own=closed.case.study.nuisances.own)
-    flare, comparison = closed.flare, closed.case.study.run.comparison()
+    if closed.study.nuisances.own:
+        choices["your own spectrum"] = NuisanceChoice(usual=False, own=closed.study.nuisances.own)
+    flare, comparison = closed.flare, closed.study.run.comparison()
     return [unknown_cost(name, closed.quiet, flare, choice, comparison) for name, choice in choices.items()]
 
 
@@ -360,4 +368,217 @@ UNKNOWN = Tab(
     "to them sees less of the flare; one that ignores them is fooled by them.",
     pictures=(unknown_costs,),
     own_view=table_of_costs,
+)
+
+
+#: Ranges of the pictures: magnitudes, and amplitudes in per cent, fixed for all questions.
+MAGNITUDES, PERCENTS = (2.0, 14.0), (0.1, 100.0)
+STEPS = 9, 5  # columns and rows of a map in closed form; smooth quantities are interpolated between them
+LABELLED = {0.1: 0.25, 0.5: 0.5, 0.9: 0.75}  # contours, with the part of the line at which the label stands
+#: Initial number of points of a curve, number of times that steps are halved, and change above which they are halved.
+FIRST, HALVINGS, CHANGE = 9, 5, 0.1
+#: Fields on which a map does not depend; an upload is identified by its content.
+FREE = {"magnitude", "amplitude_percent", "realisations", "seed", "targets", "start", "days", "hours"}
+
+
+def _cached(make: Callable[[ClosedForms], T], closed: ClosedForms, *more: float) -> T:
+    """Return a map or curve, cached for the values of the question, and `more`, on which it depends."""
+    question = closed.question
+    values = (value for name, value in question.values.items() if name not in FREE)
+    key = (*values, *(star.digest for name, star in question.uploads.items() if name == "star"), *more)
+    # Of all visitors, without the closed forms, which take tens of MB.
+    value: T | None = RESULTS.get(None, make.__name__, key)
+    if value is None:
+        value = make(closed)
+        RESULTS.keep(None, make.__name__, key, value, 32)
+    return value
+
+
+def _curve(closed: ClosedForms) -> tuple[Float, Float]:
+    """Return magnitudes and probabilities of detection, shape (241,), interpolated between points of the closed form.
+
+    There are more of these points where the probability changes.
+    """
+
+    def exact(magnitudes: Float) -> list[float]:
+        lights = 10 ** (-0.4 * (magnitudes - closed.question.magnitude))
+        return [forms[0].probability if (forms := closed.at(light, np.ones(1))) else 0.0 for light in lights]
+
+    x = np.linspace(*MAGNITUDES, FIRST)
+    y = np.array(exact(x))
+    for _ in range(HALVINGS):
+        steep = np.nonzero(np.abs(np.diff(y)) > CHANGE)[0]
+        new = (x[steep] + x[steep + 1]) / 2
+        x, y = np.insert(x, steep + 1, new), np.insert(y, steep + 1, exact(new))
+    fine = np.linspace(*MAGNITUDES, 241)
+    # Probits are smooth, but infinite for probabilities that round to 0 or 1.
+    probits = special.ndtri(np.clip(y, 1e-15, 1 - 1e-15))
+    return fine, np.asarray(special.ndtr(PchipInterpolator(x, probits)(fine)))
+
+
+def _map(closed: ClosedForms) -> tuple[Float, Float, Float]:
+    """Return magnitudes, logarithms of amplitudes in per cent, and probabilities.
+
+    The interpolated quantities are, in standard deviations without a flare: logarithms of the flare's part of the
+    statistic and of its spread, the threshold and the skewness. A gamma distribution of these moments (Pearson's type
+    III) is within 0.05 of the closed forms where they are steepest.
+    """
+    (columns, rows), (low, high) = STEPS, np.log10(PERCENTS)
+    x, y = np.linspace(*MAGNITUDES, columns), np.linspace(low, high, rows)
+    # A saturated star has no detectable flare.
+    forms = np.zeros((4, rows, columns))
+    forms[0], forms[2] = -30.0, 3.0
+    for i, light in enumerate(10 ** (-0.4 * (x - closed.question.magnitude))):
+        for j, outcome in enumerate(closed.at(light, 10**y / closed.question.amplitude_percent)):
+            null, flaring = outcome.null, outcome.flaring
+            rise = max((flaring.mean - null.mean) / null.std, 1e-9)
+            threshold = (outcome.threshold - null.mean) / null.std
+            forms[:, j, i] = np.log(rise), np.log(flaring.std / null.std), threshold, flaring.third / flaring.std**3
+    fine = np.linspace(*MAGNITUDES, 97), np.linspace(low, high, 61)
+    along_x = PchipInterpolator(x, forms, axis=2)(fine[0])
+    rise, spread, threshold, skewness = PchipInterpolator(y, along_x, axis=1)(fine[1])
+    # At low skewness the distribution is normal.
+    shape = 4 / np.maximum(skewness, 1e-4) ** 2
+    offset = np.sqrt(shape) * (threshold - np.exp(rise)) / np.exp(spread)
+    return *fine, special.gammaincc(shape, np.maximum(shape + offset, 0.0))
+
+
+@Chart(
+    "limit", "How faint a star: this flare is detected", PlotAxis("magnitude", limits=MAGNITUDES),
+    PlotAxis("detection probability", limits=(-0.03, 1.05)),
+    (
+        Line("closed form", "flare", width=2, tips=("magnitude", "detected")),
+        Rule("wanted probability", "threshold", "power", along="y"),
+        Dots("simulated", size=8),
+        OwnMarker(),
+    ),
+    sets="magnitude=x", pins="closed form", alike=("band",),
+).data()  # fmt: skip
+def curve(closed: ClosedForms, answers: Answers) -> ChartData:
+    """Return the detection probability against the star's magnitude."""
+    q, power = closed.question, closed.study.limit.power
+    series: dict[str, Any] = {"own": ([q.magnitude], [closed.chance]), "power": power}
+    text = f"The closed form of {q.statistic} takes too long for a curve: simulate it."
+    if not closed.slow:
+        x, y = series["closed form"] = _cached(_curve, closed, q.amplitude_percent)
+        text = f"{100 * power:g} % of such flares are detected {_reach(x, y, power, q.band)}"
+    if "limit" in answers:
+        before, in_words, *_ = LIMITS[closed.study.limit.of]
+        for limit in answers["limit"].limits:
+            if limit.statistic != q.statistic:
+                continue
+            # Points of another quantity than the axis's are reported in words only.
+            if limit.of == "magnitude":
+                points = [(p.value, p.probability.value) for p in (*limit.points, limit.check)]
+                series["simulated"] = np.array(points).T
+            value, low, high = map(in_words, (limit.value.value, limit.value.low, limit.value.high))
+            interval = f"{before.format(band=q.band)} {value} [{low} to {high}]"
+            text += f" Simulated: {100 * power:g} % are detected {interval}."
+    return ChartData(text, series)
+
+
+def _reach(x: Float, y: Float, power: float, band: str) -> str:
+    """Return the words for the faintest magnitude at which a probability is reached."""
+    detected = np.nonzero(y >= power)[0]
+    if not detected.size:
+        return f"at no magnitude from {MAGNITUDES[0]:g} to {MAGNITUDES[1]:g}."
+    last = int(detected[-1])
+    if last == x.size - 1:
+        return f"at least to {band} = {MAGNITUDES[1]:g}."
+    fraction = (y[last] - power) / (y[last] - y[last + 1])
+    return f"to {band} = {x[last] + fraction * (x[last + 1] - x[last]):.2f}, in closed form."
+
+
+def _draw_map(canvas: Canvas, source: ColumnDataSource) -> None:
+    plot, mapper = canvas.plot, canvas.share_colours("detected")
+    image = plot.image("image", "x", "y", "dw", "dh", source=source, color_mapper=mapper)
+    shown = [("detected", "@image{0.000}"), ("magnitude", "$x{0.00}"), ("amplitude", "@percent{0.[00]} %")]
+    plot.add_tools(HoverTool(renderers=[image], tooltips=shown))
+    plot.yaxis.ticker = FixedTicker(ticks=[-1, 0, 1, 2])
+    plot.yaxis.major_label_overrides = {-1: "0.1 %", 0: "1 %", 1: "10 %", 2: "100 %"}
+
+
+def _draw_cells(canvas: Canvas, source: ColumnDataSource) -> None:
+    colour = {"field": "p", "transform": LinearColorMapper(palette="Cividis256", low=0, high=1)}
+    cells = canvas.plot.scatter("x", "y", source=source, size=10, marker="square", fill_color=colour,
+                                line_color="#ffffff")  # fmt: skip
+    cells.name = "simulated"
+
+
+def _draw_labels(canvas: Canvas, source: ColumnDataSource) -> None:
+    canvas.plot.text(
+        "x", "y", "text", source=source, text_align="center", text_baseline="middle",
+        text_font={"value": "system-ui"}, text_font_size="11px", text_color="#1b2733", level="annotation",
+        background_fill_color="#ffffff", background_fill_alpha=0.85, padding=2,
+    ).name = "labels"  # fmt: skip
+
+
+@Chart(
+    "map", "How faint a star, how small a flare", PlotAxis("magnitude", limits=MAGNITUDES),
+    PlotAxis("flare amplitude", limits=tuple(np.log10(PERCENTS))),
+    (
+        chart.Custom("map", columns=("image", "percent", "x", "y", "dw", "dh"), draw=_draw_map),
+        chart.Contours("contours", "#ffffff", width=1.2, listed=False),
+        chart.Contours("half", "#ffffff", width=2.2, listed=False),
+        chart.Custom("simulated", columns=("x", "y", "p"), draw=_draw_cells),
+        chart.Custom("labels", columns=("x", "y", "text"), draw=_draw_labels),
+        chart.LegendEntry("10, 50 (bold) and 90 % in closed form", "#b8c0c8"),
+        chart.LegendEntry("simulated", "#8a8678", show="if any", form="dot", name="entry"),
+        OwnMarker(),
+    ),
+    sets="magnitude=x,amplitude_percent=10^y", pins="half", alike=("band",),
+).data()  # fmt: skip
+def detection_map(closed: ClosedForms, answers: Answers) -> ChartData:
+    """Return the detection probability over magnitude and amplitude."""
+    q = closed.question
+    series: dict[str, Any] = {"own": ([q.magnitude], [np.log10(q.amplitude_percent)])}
+    text = f"The closed form of {q.statistic} takes too long for a map: simulate it."
+    if not closed.slow:
+        x, y, p = _cached(_map, closed)
+        series |= _map_series(x, y, p)
+        share = 100 * float(np.mean(p >= 0.5))
+        text = (
+            f"At least half of the flares are detected in {share:.0f} % of the map, which spans {q.band} = "
+            f"{MAGNITUDES[0]:g} to {MAGNITUDES[1]:g} and amplitudes of {PERCENTS[0]:g} to {PERCENTS[1]:g} %."
+        )
+    if "map" in answers:
+        simulated = answers["map"]
+        at_x, at_y = np.meshgrid(np.array(simulated.x, float), np.log10(100 * np.array(simulated.y, float)))
+        series["simulated"] = at_x.ravel(), at_y.ravel(), simulated.probability[0].ravel()
+        text += f" {at_x.size} cells are simulated."
+    return ChartData(text, series)
+
+
+def _map_series(x: Float, y: Float, p: Float) -> dict[str, Any]:
+    """Return the data of a map, of its contours, and of their labels, which stand at different parts of the lines."""
+    half_x, half_y = 0.5 * (x[1] - x[0]), 0.5 * (y[1] - y[0])
+    wide, high = x[-1] - x[0] + 2 * half_x, y[-1] - y[0] + 2 * half_y
+    percent = np.repeat(10 ** y[:, None], x.size, axis=1)
+    generator, labels = contour_generator(x, y, p), []
+    lines: dict[float, list[Any]] = {level: list(generator.lines(level)) for level in LABELLED}
+    for level, position in LABELLED.items():
+        if lines[level]:
+            longest = max(lines[level], key=len)
+            point = longest[np.argsort(longest[:, 0])][int(position * (len(longest) - 1))]
+            labels.append((float(point[0]), float(point[1]), f"{100 * level:g} %"))
+
+    def columns(*levels: float) -> list[list[list[float]]]:
+        contours = [line for level in levels for line in lines[level]]
+        return [[line[:, axis].tolist() for line in contours] for axis in (0, 1)]
+
+    return {
+        "map": ([p], [percent], [x[0] - half_x], [y[0] - half_y], [wide], [high]),
+        "contours": columns(0.1, 0.9),
+        "half": columns(0.5),
+        "labels": tuple(zip(*labels, strict=True)) or ([], [], []),
+    }
+
+
+LIMIT = Tab(
+    verb="limit",
+    title="Limit and map",
+    about="How faint a star and how small a flare one would still see.",
+    pictures=(curve, detection_map),
+    simulations={"limit": "Simulate the limit", "map": "Simulate the map"},
+    files={"limit": "limit", "map": "map"},
 )

@@ -19,7 +19,6 @@ from mauvecl.host.tables.text_tables import columns, text_table
 from mauvecl.schema.errors import REMEDY, SUBJECT, InputError, shortened
 from mauvecl.schema.fields import (
     Flag,
-    Help,
     LineFraction,
     Range,
     Unit,
@@ -31,6 +30,7 @@ from mauvecl.schema.fields import (
     with_unit,
 )
 from mauvecl.schema.section import check_different
+from mauvecl.study.star import FILE_KEYS, FLARE_FILE_KEYS
 from mauvecl.study.study import keys_of, study_keys
 
 #: Texts of fields with an uploaded file: those that also accept a name or numbers, and all others.
@@ -46,11 +46,17 @@ FORMER_VALUES = {
     "unknown": {"nothing": IDEAL, "the usual": REALISTIC},
     "instrument": {"mauve": FORMERLY_MAUVE} | FORMER_NAMES,
 }
-#: Headings of fields by the section of their key, unless they state another; fields of other sections show at once.
+#: Headings of fields by their key or by its section; other fields show at once.
 HEADINGS = {
-    "flare.spectrum": "Flare's spectrum", "sky": "Sky", "run": "Detection", "limit": "Limit", "search": "Search",
-    "stare.pointing": "Pointing", "orbit": "Campaign", "plan": "Campaign", "measure": "Measurement", "data": "Frames",
-    "calibrate": "Standards", "change": "Change",
+    "flare.spectrum": "Flare's spectrum", "flare.temperature_k": "Flare's spectrum", "sky": "Sky",
+    "observation.signal": "Sky", "observation.temperature_c": "Detector", "run": "Detection",
+    "limit.power": "Detection", "limit": "Limit", "search": "Search", "stare.pointing": "Pointing",
+    "orbit": "Campaign", "plan": "Campaign", "measure": "Measurement", "star.distance_pc": "Measurement",
+    "data": "Frames", "calibrate": "Standards", "change": "Change", "star.ebv": "Star",
+    **dict.fromkeys(("star.neighbours", "star.neighbours_of", "star.neighbour_share"), "Neighbours"),
+    **{f"star.{key}": "Own spectrum" for key in FILE_KEYS},
+    **{f"flare.spectrum.{key}": "Own flare" for key in FLARE_FILE_KEYS},
+    **{f"change.{key}": "Added spectrum" for key in ("band", "wavelength_unit", "flux_unit", "extend")},
 }  # fmt: skip
 MOST_CHARACTERS, MOST_TABLE = 200, 3000  # lengths of a field, and of a table of neighbours, which is a part of links
 MOST_TARGETS = 30  # largest number of targets of a visitor
@@ -216,6 +222,7 @@ class Field(Widget):
 
     first: str  # text of a new page
     unit: str = ""
+    group: str = ""  # heading of its group; empty for a field that shows at once
     read: Callable[[str], Any]  # converts text to the value; raises InputError with what is accepted
     path: tuple[str, ...] = ()  # key of the study that takes the value; empty if `FieldValues` converts it
     own_keys: tuple[str, ...] = ()  # keys and sections of the study that it sets without a path
@@ -227,20 +234,29 @@ class Field(Widget):
         return self.own_keys or (".".join(self.path),)
 
 
-def _field(path: tuple[str, ...], field: FieldInfo, widget: Widget) -> Field:
+def _name(key: str, field: FieldInfo, widget: Widget) -> str:
+    """Return the name of the field of a key, such as "exposure_s", or "change_band" as in the flag --change-band."""
+    name = key.rpartition(".")[2]
+    with_section = f"{key.partition('.')[0]}_{name}"
+    has_section = any(with_section.startswith(flag.parameter) for flag in metadata_of(field, Flag))
+    return widget.name or (with_section if has_section else name)
+
+
+def _field(key: str, field: FieldInfo, widget: Widget) -> Field:
     """Return the field of a key from its metadata."""
-    default, unit = field.get_default(), first(field, Unit) or Unit("")
+    section = key.rpartition(".")[0]
+    default, unit, flag = field.get_default(), first(field, Unit) or Unit(""), first(field, Flag) or Flag("")
     text = as_typed(default * widget.scale if isinstance(default, float) else default, truth=("no", "yes"))
     optional = text == "" if widget.first is None else not widget.first
     texts = {
-        "label": widget.label or getattr(first(field, Help), "text", ""),
-        "group": widget.group or HEADINGS.get(".".join(path[:-1]), ""),
+        "label": widget.label or flag.label,
+        "group": next((HEADINGS[place] for place in (key, section) if place in HEADINGS), ""),
         "first": text if widget.first is None else widget.first,
         "unit": unit.written if widget.unit is None else widget.unit,
         "read": _reader(field, widget, unit.name, optional=optional),
         "characters": MOST_TABLE if widget.kind == "table" else MOST_CHARACTERS,
     }
-    return Field(**(vars(widget) | texts), path=path)
+    return Field(**(vars(widget) | texts), path=tuple(key.split(".")))
 
 
 #: Readers of fields by the kind of their widget.
@@ -280,7 +296,7 @@ _OWN_FIELDS = {
         label="Star", first="G2V", read=star_name,
         hint="Whose spectrum: a spectral type of the library, one of its stars by any name (GJ 581, HD 40307), a "
         "blackbody (blackbody 9000 K), a power law of the wavelength (power law -2), or your own file.",
-        group="", place=-1, own_keys=("star.library",),
+        place=-1, own_keys=("star.library",),
     ),
     "lines": Field(
         label="Emission lines", first="", read=line_fluxes,
@@ -300,7 +316,7 @@ _OWN_FIELDS = {
         label="Kind of answer", first=REALISTIC, read=Choice(UNKNOWN),
         hint="Realistic: detector temperature, light lost and sky differ from exposure to exposure and are unknown; "
         "they are drawn, and the statistic is made blind to them. Ideal: everything but the noise is known. The card "
-        "shows both chances; this is for the pictures, tables and simulations.", group="", place=3,
+        "shows both chances; this is for the pictures, tables and simulations.", place=3,
         own_keys=("nuisances.usual",),
     ),
     "own_unknown": Field(
@@ -324,7 +340,7 @@ _OWN_FIELDS = {
     ),
 }  # fmt: skip
 _KEYS = {
-    widget.name or key.rpartition(".")[2]: _field(tuple(key.split(".")), field, widget)
+    _name(key, field, widget): _field(key, field, widget)
     for key, field in study_keys().items()
     for widget in metadata_of(field, Widget)
 }

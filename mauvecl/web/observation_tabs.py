@@ -1,20 +1,28 @@
-"""Tabs of observations: light curves, calibrations, changes between visits, and campaigns."""
+"""Tabs of observations: measured flares, stares, light curves, calibrations, changes between visits, and campaigns."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from bokeh.models import FixedTicker, HoverTool, LinearColorMapper
 from bokeh.palettes import interp_palette
 
-from mauvecl.answers.plan import COLUMNS
+from mauvecl.answers.measure import COLUMNS as MEASURED_COLUMNS
+from mauvecl.answers.measure import expected_measurements, models_of
+from mauvecl.answers.plan import COLUMNS as PLAN_COLUMNS
 from mauvecl.charts import chart, light_curves, spectra
-from mauvecl.charts.chart import Chart, ChartData, Custom, OwnMarker, PlotAxis, Targets
-from mauvecl.host.arrays import PER_MAD
+from mauvecl.charts.chart import Area, Chart, ChartData, Custom, Dots, Line, OwnMarker, PlotAxis, Rule, Targets
+from mauvecl.charts.spectra import FACTORS, RISES
+from mauvecl.fits.flare_model import FlareModel
+from mauvecl.host.arrays import PER_MAD, Float
 from mauvecl.host.stars.source import Source
+from mauvecl.schema.columns import View, chance_text, records
 from mauvecl.schema.errors import InputError
+from mauvecl.study.observation import KNOWN, NuisanceChoice
 from mauvecl.web.closed_forms import Answers, short
 from mauvecl.web.sandboxed_reader import read_limited
 from mauvecl.web.tab import Tab, target_words
@@ -24,13 +32,243 @@ if TYPE_CHECKING:
     from bokeh.models.sources import ColumnDataSource
 
     from mauvecl.answers.change import ChangeAnswer
+    from mauvecl.answers.measure import ExpectedMeasurement
     from mauvecl.answers.plan import PlanAnswer
     from mauvecl.answers.visible import VisibleAnswer
+    from mauvecl.fits.spectrum import Forecast
     from mauvecl.observations.analysis import Analysis
     from mauvecl.observations.frames import Frames
     from mauvecl.web.closed_forms import ClosedForms, FieldValues
-    from mauvecl.web.figures import Canvas
+    from mauvecl.web.tab import Canvas
     from mauvecl.web.uploads import Observations
+
+#: Unknowns of an observer, by name on the page, as the study's section of nuisances.
+ASSUMED = {
+    "everything known": KNOWN,
+    "usual unknowns": NuisanceChoice(),
+    "dark and star free": NuisanceChoice.model_validate({"usual": False, "dark": "free", "light": "free"}),
+}
+NAMES = ("known", "usual", "free")  # names of the curves
+NEAR = (2.0, 6.0)  # half-widths before and after the peak of a flare in a stare that are shown
+MOST_DOTS = 500  # largest number of simulated fits that are shown
+
+
+@lru_cache(maxsize=4)
+def forecast(closed: ClosedForms) -> dict[str, ExpectedMeasurement]:
+    """Return the forecast with the flare's own model for each of `ASSUMED`."""
+    case = closed.case
+    own_model = dict(list(models_of(case).items())[-1:])
+    measurements = {}
+    for name, nuisances in ASSUMED.items():
+        assumed = case.with_sections(nuisances=nuisances)
+        (measurements[name],) = expected_measurements(assumed, case.amplitudes[0], closed.flare, own_model)
+    return measurements
+
+
+@Chart(
+    "errors", "Error of the temperature for smaller and larger flares", PlotAxis("flare amplitude (%)", log=True),
+    PlotAxis("error of the temperature (%)", log=True, limits=(0.1, 1000)),
+    (
+        # Errors with other unknowns may be the same: dashes show the curve below.
+        *(
+            Line(label, colour, name, width=2, dash="dashed" * (name == "free"), tips=("amplitude (%)", f"{label} (%)"))
+            for label, name, colour in zip(ASSUMED, NAMES, ("flare", "star", "sky"), strict=True)
+        ),
+        OwnMarker(),
+    ),
+    sets="amplitude_percent=x", pins="known",
+).data()  # fmt: skip
+def temperature_errors(closed: ClosedForms, answers: Answers) -> ChartData:
+    """Return the relative error of the temperature against the amplitude of the flare."""
+    # Fewer amplitudes than in files suffice.
+    percent, factors, series = 100 * closed.case.amplitudes[0], FACTORS[::3], dict[str, Any]()
+    for name, measurement in zip(NAMES, forecast(closed).values(), strict=True):
+        ahead = measurement.forecasts(factors, measurement.unknown)
+        series[name] = percent * factors, [100 * f.errors[0] / f.values[0] for f in ahead]
+    all_known, *_, free = forecast(closed).values()
+    quantity = "temperature" if isinstance(all_known.fitted, FlareModel) else "lower temperature"
+    series["own"] = [percent], [100 * all_known.ahead.errors[0] / all_known.ahead.values[0]]
+    text = (
+        f"With everything known the {quantity} has a standard error of {short(all_known.ahead.errors[0])} K, with dark "
+        f"level and star unknown one of {short(free.ahead.errors[0])} K."
+    )
+    return ChartData(text, series)
+
+
+@Chart(
+    "region", "Temperature and amplitude: 95 % confidence region", PlotAxis("temperature (K)"),
+    PlotAxis("amplitude of the blackbody (%)"),
+    (
+        Area("dark and star free", "sky", "free", alpha=0.3),
+        Area("everything known", "flare", "known", alpha=0.5),
+        Dots("simulated fits", name="fits", size=3),
+        OwnMarker("the flare"),
+    ),
+    logs=("x",),
+).data()  # fmt: skip
+def region(closed: ClosedForms, answers: Answers) -> ChartData:
+    """Return the confidence region of temperature and amplitude."""
+    all_known, *_, free = forecast(closed).values()
+    # A fit without noise stands for a flare without these quantities, such as one from a file.
+    true, without_noise = all_known.truth[:2], all_known.perfect.estimates[0, :2]
+    best = true if np.isfinite(true).all() else without_noise
+    series: dict[str, Any] = {"own": ([best[0]], [100 * best[1]])}
+    if "measure" in answers:
+        # The last fits are those of the flare's own model.
+        estimates = answers["measure"].flares[-1].found.estimates[:MOST_DOTS]
+        series["fits"] = estimates[:, 0], 100 * estimates[:, 1]
+    one_temperature = isinstance(all_known.fitted, FlareModel)
+    for name, measurement in (("known", all_known), ("free", free)):
+        kelvin, low, high = measurement.region(RISES["95 %"]) if one_temperature else _ellipse(best, measurement.ahead)
+        series[name] = kelvin, 100 * low, 100 * high
+    x = np.asarray(series["free"][0])
+    text = (
+        f"With dark level and star unknown the 95 % region reaches from {short(x[0])} to {short(x[-1])} K: hotter "
+        "flares of smaller area look alike."
+        if one_temperature
+        else "The flare has two temperatures, of which this is the lower one. Regions follow from its standard "
+        "errors where these are below 100 %; simulated fits need no such limit."
+    )
+    return ChartData(text, series)
+
+
+def _ellipse(best: Float, ahead: Forecast) -> tuple[Float, Float, Float]:
+    """Return the confidence region of the first two quantities, of normal errors of their logarithms.
+
+    Its temperatures, with the smallest and largest amplitude at each, are empty for errors of 100 % or more.
+    """
+    spread = ahead.covariance[:2, :2] / np.outer(best, best)
+    if not (np.diag(spread) < 1.0).all():
+        return np.empty(0), np.empty(0), np.empty(0)
+    angle, slope = np.linspace(-np.pi / 2, np.pi / 2, 161), spread[0, 1] / spread[0, 0]
+    along = np.sqrt(RISES["95 %"] * spread[0, 0]) * np.sin(angle)
+    half = np.sqrt(RISES["95 %"] * (spread[1, 1] - slope * spread[0, 1])) * np.cos(angle)
+    low, high = (best[1] * np.exp(slope * along + side) for side in (-half, half))
+    return best[0] * np.exp(along), low, high
+
+
+@Chart(
+    "course", "Temperature of the flare along a stare", PlotAxis("time from the start of the stare (s)"),
+    PlotAxis("temperature (K)", log=True),
+    (
+        Area("bins of frames: 95 % interval", "star", "bins", alpha=0.3),
+        Dots("bins of frames", "star", "estimates"),
+        Line("simulated flare", "total", "true", dash="dashed"),
+        Line("joint fit", "flare", "joint", width=2),
+    ),
+).data()  # fmt: skip
+def course(closed: ClosedForms, answers: Answers) -> ChartData:
+    """Return the temperature along a simulated stare."""
+    stares = answers["measure"].stares if "measure" in answers else []
+    if not stares:
+        return ChartData("No stare is measured yet: choose a joint fit or the S/N of bins, and simulate fits.")
+    (stare_fit,), words, series = stares, list[str](), dict[str, Any]()
+    if stare_fit.joint is not None:
+        (event,), stare = stare_fit.events, stare_fit.staring.stare
+        since = (stare.middle_s - event.peak_s) / event.half_width_s
+        near = (since > -NEAR[0]) & (since < NEAR[1])
+        for name, fit in (("true", stare_fit.joint.true), ("joint", stare_fit.joint.fitted)):
+            series[name] = stare.middle_s[near], fit.kelvin[near]
+        fits = stare_fit.joint.found
+        rows = zip(fits.names[:4], fits.units, fits.estimates[0], fits.errors[0], strict=False)
+        words += [f"{name} {short(best)} +- {short(error)} {unit}".strip() for name, unit, best, error in rows]
+    if stare_fit.unmeasured:
+        words.append(stare_fit.unmeasured)
+    elif stare_fit.drawn is not None:
+        bins, fits = stare_fit.drawn, stare_fit.drawn.found
+        x, kelvin = (bins.start_s + bins.end_s) / 2, fits.estimates[:, 0]
+        ends = (np.where(np.isfinite(end), end, kelvin) for end in (fits.low[-1, :, 0], fits.high[-1, :, 0]))
+        series |= {"estimates": (x, kelvin), "bins": (x, *ends)}
+        two = not isinstance(next(iter(forecast(closed).values())).fitted, FlareModel)
+        words.append(f"{x.size} bins of frames{', each fitted with one temperature' if two else ''}")
+    return ChartData(f"One simulated stare: {'; '.join(words)}.", series)
+
+
+def measured(closed: ClosedForms, answers: Answers) -> View:
+    """Return the errors of each quantity, and the counts of simulated fits."""
+    measurements = forecast(closed)
+    first, *_ = measurements.values()
+    errors = [measurement.ahead.errors for measurement in measurements.values()]
+    rows = zip(first.ahead.names, first.ahead.units, first.truth, *errors, strict=True)
+    table = [dict(zip(("quantity", "unit", "truth", *measurements), row, strict=True)) for row in rows]
+    verb = {column.name: column for column in MEASURED_COLUMNS}
+    of_error = [replace(verb["error"], name=name, heading=f"error, {name}") for name in measurements]
+    columns = [verb["quantity"], verb["unit"], verb["truth"], *of_error]
+    if "measure" in answers:
+        counts = records(answers["measure"].flares[-1].rows())
+        table = [row | counted for row, counted in zip(table, counts, strict=True)]
+        columns += [verb["scatter"], verb["coverage_95"]]
+    return View("", columns, table)
+
+
+MEASUREMENT = Tab(
+    verb="measure",
+    # Fits along a flare have no pointing losses.
+    never=("pointing_rate", "pointing_duration", "pointing_depth"),
+    about="What is measured of the flare once it is detected: its temperature, size and light, with errors in closed "
+    "form; simulated fits count how often their intervals hold the truth.",
+    pictures=(temperature_errors, region, course),
+    simulations={"measure": "Simulate fits"},
+    files=dict.fromkeys(("measure", "fits", "temperatures", "joint"), "measure"),
+    own_view=measured,
+)
+
+
+LENGTHS = ("shortest", "middle", "longest")  # half-widths of injected flares, one per line of the picture
+
+
+@Chart(
+    "shares", "Share of flares that a search of a stare finds",
+    PlotAxis("peak amplitude of the flare (%)", log=True, limits=(0.01, 100)),
+    PlotAxis("share of flares found", limits=(-0.03, 1.05)),
+    (
+        *(
+            series
+            for k, length in enumerate(LENGTHS)
+            for series in (
+                Area(f"{length} flares", length, f"band {k}", listed=False),
+                Line(f"{length} flares", length, f"line {k}", width=2,
+                     tips=("amplitude (%)", f"found of the {length}")),
+            )
+        ),
+        Rule("amplitude of your question", "own", "own"),
+    ),
+).data()  # fmt: skip
+def shares(closed: ClosedForms, answers: Answers) -> ChartData:
+    """Return the fraction of injected flares that the search finds against their amplitude."""
+    series: dict[str, Any] = {"own": closed.question.amplitude_percent}
+    if "completeness" not in answers:
+        text = (
+            "Nothing is injected yet: Inject flares puts flares of several lengths and sizes into a stare of one "
+            "orbit, and searches it."
+        )
+        return ChartData(text, series)
+    injected, clauses = answers["completeness"].stars[0].injected, []
+    for k, width in enumerate(injected.half_widths_s):
+        x, share = 100 * injected.sizes, injected.completeness[k]
+        series[f"line {k}"] = x, share
+        series[f"band {k}"] = x, injected.completeness_low[k], injected.completeness_high[k]
+        completeness = float(np.interp(np.log(closed.question.amplitude_percent), np.log(x), share))
+        clauses.append(f"{chance_text(completeness)} of those of half-width {short(width)} s")
+    peak = f"{closed.question.amplitude_percent:g} %"
+    return ChartData(f"Of flares that peak at {peak} the search finds {'; '.join(clauses)}.", series)
+
+
+COMPLETENESS = Tab(
+    name="completeness",
+    title="Stare",
+    about="One exposure sees a flare at its peak; a stare sees it rise and fade. This tab shows which flares a search "
+    "of one orbit finds at the chosen rate of false alarms, with losses while the star drifts out of the fibre.",
+    pictures=(shares,),
+    chance=False,
+    # The picture reads off the share of flares of this size.
+    also=("amplitude_percent",),
+    simulations={"completeness": "Inject flares"},
+    answer="completeness",
+    view=1,
+    files={"completeness": "completeness", "limits": "completeness"},
+)
+
 
 #: Largest numbers of points of a light curve, and of columns and rows of a dynamic spectrum.
 MOST_POINTS, MOST_COLUMNS, MOST_ROWS = 8000, 600, 300
@@ -104,7 +342,7 @@ def dynamic_spectrum(closed: ClosedForms, answers: Answers) -> ChartData:
 
 
 def read_frames(question: FieldValues) -> dict[str, Any]:
-    """Read the frames."""
+    """Read the visitor's frames, as an argument of the verb; raises InputError if they hold too many values."""
     files = question.uploads
     frames = read_frames_of(files["frames"], files.get("mapping"), quality_bits=question.quality_bits)
     if frames.flux.size > MOST_VALUES:
@@ -132,7 +370,10 @@ ANALYSE = Tab(
 
 
 def read_observations(question: FieldValues) -> dict[str, Any]:
-    """Read frames and spectra."""
+    """Read the raw frames and spectra of the visitor's archive, as arguments of the verb.
+
+    Raises InputError if all frames together hold too many values.
+    """
     archive: Observations = question.uploads["observations"]
     files = {name: VisitorFile(name, content) for name, content in unzipped(archive.content).items()}
     frames, stars = [], []
@@ -165,7 +406,10 @@ CALIBRATE = Tab(
 
 
 def _against_magnitude(name: str, title: str, label: str, units: Mapping[str, float]) -> Chart:
-    """Return the chart of the smallest changes of some units, with the factor from each to that of the axis."""
+    """Return the chart of the smallest detected changes against the star's magnitude.
+
+    It shows the changes in one of `units`, which hold the factor from each unit to that of the axis.
+    """
 
     def along(closed: ClosedForms, answer: ChangeAnswer) -> ChartData:
         rows = [row for row in answer.changes if row.change.unit in units]
@@ -310,7 +554,7 @@ def expected(closed: ClosedForms, answer: PlanAnswer) -> ChartData:
 def columns_of_plan(question: FieldValues) -> list[list[str]]:
     """Return the targets, and the columns that a plan will have."""
     names = [target["name"] for target in question.targets] or ["each target"]
-    headings = [column.heading for column in COLUMNS if column.heading and column.when is None]
+    headings = [column.heading for column in PLAN_COLUMNS if column.heading and column.when is None]
     return [headings, *([name, *("·" for _ in headings[1:])] for name in names)]
 
 

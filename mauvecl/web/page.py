@@ -1,13 +1,24 @@
-"""The page's tabs, its state, which a link gives, its card, and the stars that it knows."""
+"""The page's tabs, its state, which a link gives, its card, and what visitors take along: files, commands, programs."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Collection, Iterable, Mapping
-from typing import Any
+import io
+import json
+import re
+import shlex
+import tempfile
+import threading
+import zipfile
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from pathlib import Path
+from pprint import pformat
+from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
 
-from mauvecl.answers.answer import IF_KNOWN
+from pydantic import BaseModel, TypeAdapter
+
+from mauvecl.answers.answer import IF_KNOWN, write_table
 from mauvecl.answers.closed_forms import BOTH_CHANCES
 from mauvecl.answers.detect import chance_of_flare
 from mauvecl.answers.verbs import GROUPS, VERBS
@@ -17,16 +28,38 @@ from mauvecl.host.stars.library import listed_note, resolve
 from mauvecl.host.tables.units import offline
 from mauvecl.schema.columns import chance_text
 from mauvecl.schema.errors import InputError, of_kind, shortened
-from mauvecl.schema.fields import as_typed
+from mauvecl.schema.fields import Flag, as_typed, metadata_of
+from mauvecl.schema.section import read_axis, read_line_fluxes, read_words
 from mauvecl.study.plan import PlanTarget
+from mauvecl.study.star import Star
+from mauvecl.study.study import Study, keys_of, set_key, with_paths
 from mauvecl.web.closed_forms import OTHER, TITLES, Answers, ClosedForms, FieldValues, chances, short
-from mauvecl.web.exposure_tabs import DETECTION, NOISE, SIGNAL, SPECTRUM, UNKNOWN
+from mauvecl.web.exposure_tabs import DETECTION, LIMIT, NOISE, SIGNAL, SPECTRUM, UNKNOWN
 from mauvecl.web.fields import FIELDS, FORMER_VALUES, IDEAL, REALISTIC, UPLOADED, Choice, Field, note, sentence, targets
-from mauvecl.web.flare_tabs import COMPLETENESS, LIMIT, MEASUREMENT
-from mauvecl.web.observation_tabs import ANALYSE, CALIBRATE, CHANGE, PERIODS, PLAN, VISIBILITY
-from mauvecl.web.tab import Tab
+from mauvecl.web.observation_tabs import (
+    ANALYSE,
+    CALIBRATE,
+    CHANGE,
+    COMPLETENESS,
+    MEASUREMENT,
+    PERIODS,
+    PLAN,
+    VISIBILITY,
+)
+from mauvecl.web.tab import QUESTIONS, Tab
 from mauvecl.web.uploads import UPLOADS
 
+if TYPE_CHECKING:
+    from mauvecl.answers.verbs import Verb
+
+#: Keys that are stated even at their default, so that readers see what was assumed.
+STATED = ("star", "flare.amplitudes", "observation.exposure_s", "observation.instrument", "sky", "run.fap",
+          "run.realisations", "run.seed")  # fmt: skip
+#: Keys that verbs use without a flag for them, since everything that observes draws unknowns.
+ALWAYS_USED = ("nuisances.", "observation.temperature_c")
+MOST_CHARACTERS = 500  # longest value in a command; a longer one is in the study file
+ANYTHING = TypeAdapter(Any)
+_drawing = threading.Lock()  # held while matplotlib draws
 WITH_MESSAGES = ("detection", "measure")  # answers whose messages are shown, which include those of the others
 NOMINAL = "The throughput is nominal"  # start of the message about it, which the page shows once
 #: Kinds of messages that change the answer, which are shown in red.
@@ -97,7 +130,7 @@ def _with_chance(headline: str, closed: ClosedForms, answers: Answers) -> dict[s
     if not headline and chosen.value == chosen.value:
         ideal = q.unknown == REALISTIC and all(chance.value == chance.value for chance in of_choices)
         text = shown[q.unknown] + (f" ({shown[IDEAL]} {IF_KNOWN})" if ideal else "")
-        text = chance_of_flare(closed.case.study, closed.case.label, closed.case.amplitudes[0], x, text)
+        text = chance_of_flare(closed.study, closed.case.label, closed.case.amplitudes[0], x, text)
         headline = f"{text}, by the estimate before a simulation."
     messages = [message for name in WITH_MESSAGES if name in answers for message in answers[name].messages]
     facts = []
@@ -146,8 +179,8 @@ def _simulation_names(text: str) -> tuple[str, ...]:
 
 #: Entries of a link in addition to the question.
 SEEN = {
-    "tab": Field(label="Tab", hint="", first=next(iter(TABS)), read=Choice(tuple(TABS))),
-    "simulated": Field(label="Simulated", hint="", first="", read=_simulation_names),
+    "tab": Field(label="Tab", first=next(iter(TABS)), read=Choice(tuple(TABS))),
+    "simulated": Field(label="Simulated", first="", read=_simulation_names),
 }
 #: All entries of a link, and their values on a new page.
 ENTRIES = FIELDS | SEEN
@@ -161,37 +194,45 @@ class State:
     """
 
     def __init__(self, link: str = "", uploads: Mapping[str, Any] | None = None) -> None:
-        # The message `stray` is on entries that are no fields, or that no field can correct.
-        self.uploads, self.stray, query = dict(uploads or {}), "", link.removeprefix("?")
+        self.uploads, self.stray = dict(uploads or {}), ""
+        self.entered = {name: field.first for name, field in ENTRIES.items()}
+        self._values, self._invalid = dict(FIRST), dict[str, str]()  # by entry: values, and errors of invalid texts
+        texts = self._parse(link)
+        for name, field in ENTRIES.items():
+            if name in texts:
+                self.entered[name] = texts[name][: field.characters]
+                try:
+                    self._values[name] = self._read(name, texts[name])
+                except InputError as error:
+                    self._invalid[name] = sentence(error)
+        for name, field in SEEN.items():
+            if name in self._invalid:
+                self.entered[name] = field.first
+                self.stray += f" The link's {name}: {self._invalid.pop(name)}; it was left out."
+
+    def _parse(self, link: str) -> dict[str, str]:
+        """Return the texts of a link by entry, those of version 1 in today's words, and report entries in `stray`."""
+        query = link.removeprefix("?")
         if len(query) > MOST_LINKED:
-            query, self.stray = "", f"The link has more than {MOST_LINKED} characters and was left out."
+            self.stray = f"The link has more than {MOST_LINKED} characters and was left out."
+            return {}
         texts = dict(parse_qsl(query, keep_blank_values=True, errors="replace"))
         if unknown := sorted(texts.keys() - ENTRIES.keys()):
             self.stray = f"The link holds {shortened(', '.join(unknown))}, which is no field here; it was left out."
         if texts.get("unknown") in FORMER_VALUES["unknown"]:
             self.stray += " The link is of version 1: its payload and unknowns have other names today."
-            for name, values in FORMER_VALUES.items():
-                if name in texts:
-                    texts[name] = values.get(texts[name], texts[name])
-        self.entered = {name: field.first for name, field in ENTRIES.items()}
-        self._values, self._invalid = dict(FIRST), dict[str, str]()
-        for name, field in ENTRIES.items():
-            if name not in texts:
-                continue
-            text = texts[name]
-            self.entered[name] = text[: field.characters]
-            try:
-                if len(text) > field.characters:
-                    raise InputError(f"{shortened(text)} is too long: enter at most {field.characters} characters")
-                self._values[name] = field.read(text)
-                if name in UPLOADS and text == UPLOADS[name].entered and name not in self.uploads:
-                    raise InputError(f"the {text} is not here: give its file again, since links do not hold it")
-            except InputError as error:
-                self._invalid[name] = sentence(error)
-        for name, field in SEEN.items():
-            if name in self._invalid:
-                self.entered[name] = field.first
-                self.stray += f" The link's {name}: {self._invalid.pop(name)}; it was left out."
+            for name in FORMER_VALUES.keys() & texts.keys():
+                texts[name] = FORMER_VALUES[name].get(texts[name], texts[name])
+        return texts
+
+    def _read(self, name: str, text: str) -> Any:
+        """Return the value of an entry; raises InputError for an invalid text, or one of a file that is not here."""
+        field = ENTRIES[name]
+        if len(text) > field.characters:
+            raise InputError(f"{shortened(text)} is too long: enter at most {field.characters} characters")
+        if name in UPLOADS and text == UPLOADS[name].entered and name not in self.uploads:
+            raise InputError(f"the {text} is not here: give its file again, since links do not hold it")
+        return field.read(text)
 
     def faults_of(self, names: Collection[str]) -> dict[str, str]:
         """Return the error messages of some fields, with those of values that cannot be together."""
@@ -256,3 +297,146 @@ def _target(row: dict[str, Any]) -> dict[str, str]:
     facts = {"spectral_type": star.spectral_type, "V": star.magnitude, "distance_pc": star.distance_pc}
     target = {key: as_typed(value) for key, value in facts.items()}
     return target | {"coordinates": f"{star.ra_deg:.3f} {star.dec_deg:+.3f}", "about": star.source}
+
+
+PROGRAM = """from mauvecl import Engine, Study, {verb}
+
+study = Study.build(
+    {data},
+    "page",
+)
+answer = {verb}(study, Engine(){options})
+print(next(iter(answer.tables.values())))
+"""
+
+
+def differing(new: BaseModel, old: BaseModel, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the dotted path and the plain value of each key that has another value in `old`, or is `STATED`."""
+    for key, model_field in type(new).model_fields.items():
+        name, value, old_value = f"{path}{key}", getattr(new, key), getattr(old, key)
+        # A new sky replaces all keys of the old one, and so does a section with a flag of its own.
+        replaces = name == "sky" or bool(metadata_of(model_field, Flag))
+        if isinstance(value, BaseModel) and isinstance(old_value, BaseModel) and not replaces:
+            yield from differing(value, old_value, f"{name}.")
+        elif value is not None and (value != old_value or name in STATED):
+            # As TOML can hold it, without the defaults of records.
+            yield name, ANYTHING.dump_python(value, mode="json", exclude_defaults=True, exclude_none=True)
+
+
+def as_command(verb: str, study: Study) -> str:
+    """Return a question to a verb as a command, which names a study file if flags cannot say all of it."""
+    question, from_file = VERBS[verb], shlex.join(["mauvecl", verb, "study.toml"])
+    if any(file is not None for file in (study.flare.spectrum.file, *(star.file for star in study.star))):
+        return from_file
+    base = Study().with_settings([f"{key}={value}" for key, value in (question.defaults or {}).items()])
+    words = ["mauvecl", verb]
+    for name, value in keys_used(question, study, base):
+        if name == "data.file":
+            words.insert(2, value)
+        elif name == "star":
+            for star in value:
+                usual = Star(library=star.get("library"))
+                stated = {key: entry for key, entry in star.items() if entry != getattr(usual, key)}
+                words += _flag_words("star", {"library": usual.library} | stated, question)
+        elif name == "sky":
+            words += ["--sky", "none"] if value.get("none") else _flag_words("sky", value, question)
+        else:
+            # TOML on one line is JSON with another separator, and bare keys.
+            toml = json.dumps(value, ensure_ascii=False, separators=(", ", " = "))
+            toml = re.sub(r'"(\w+)" = ', r"\1 = ", toml, flags=re.ASCII)
+            words += _flag_words(name, value, question) or ["--set", f"{name}={toml}"]
+    return from_file if max(map(len, words)) > MOST_CHARACTERS else shlex.join(words)
+
+
+def keys_used(verb: Verb, study: Study, base: Study) -> Iterator[tuple[str, Any]]:
+    """Yield the keys that a verb uses of a study, with their plain values, if they are `differing` from a base."""
+    flagged = {key for key, *_ in keys_of()}
+    observes = verb.accepts("star.library")
+    for name, value in differing(study, base):
+        if name in ("star", "sky"):
+            used = observes if name == "star" else verb.accepts("sky.surface_brightness")
+        else:
+            used = verb.accepts(name) or name not in flagged or (observes and name.startswith(ALWAYS_USED))
+        if used:
+            yield name, value
+
+
+def _flag_words(name: str, value: Any, verb: Verb) -> list[str]:
+    """Return the words of the flag of a key, or of each key of a star or sky; none if no flag takes such a value."""
+    if name in ("star", "sky"):
+        return [word for key, inner in value.items() for word in _flag_words(f"{name}.{key}", inner, verb)]
+    for flag in (flag for key, _, flag in keys_of() if key == name and verb.accepts(name)):
+        if isinstance(value, bool) and flag.read is None:
+            on, _, off = flag.names[0].partition("/")
+            return [on] if value else [off] if off else []
+        if flag.read is read_line_fluxes:
+            return [word for line, share in value.items() for word in (flag.names[0], f"{line}={share!r}")]
+        if flag.read is read_axis and "start" in value:
+            spaced = [value["quantity"], *(_text(value[key]) for key in ("start", "stop", "steps"))]
+            return [flag.names[0], ":".join(spaced + ["log"] * value.get("log", False))]
+        if flag.read in (None, read_words):
+            values = value if isinstance(value, list) else [value]
+            if all(isinstance(item, str | int | float) for item in values):
+                return [word for item in values for word in (flag.names[0], _text(item))]
+    return []
+
+
+def _text(value: str | float) -> str:
+    """Return a value as it is typed, with every digit of a number."""
+    return value if isinstance(value, str) else str(value).removesuffix(".0")
+
+
+def study_file(study: Study, name: str) -> tuple[str, bytes]:
+    """Return name and content of the study file, in a zip archive with the visitor's files if there are any."""
+    # The visitor's files that the study names, each once.
+    files, text = dict[Path, Path](), study.toml()
+    with_paths(study, lambda file: files.setdefault(file, file))
+    if not files:
+        return f"{name}.toml", text.encode()
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for file in files:
+            archive.write(file, file.name)
+            # Paths relative to the study, instead of those on the server.
+            text = text.replace(str(file.resolve()), file.name)
+        archive.writestr("study.toml", text)
+    return f"{name}.zip", out.getvalue()
+
+
+def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answers) -> tuple[str, bytes]:
+    """Return file name and content of one of a tab's `files` or `documents`, or of the study that reproduces it.
+
+    The ending is "ecsv", "fits" or "study", and empty for a document.
+    """
+    if name not in tab.documents and (name not in tab.files or ending not in ("ecsv", "fits", "study")):
+        raise InputError(f"{tab.title} has no file {name[:40]!r}.{ending[:10]}; use one of its own", key="name")
+    if not tab.offers(name, answers):
+        raise InputError(f"no {name} is computed yet: start a simulation first", key="name")
+    if name in tab.documents:
+        # Matplotlib's settings are those of the process.
+        with _drawing:
+            return name, answers[tab.documents[name]].documents[name]()
+    if ending == "study":
+        needed = tab.files[name]
+        return study_file(closed.study if needed is None else answers[needed].study, f"mauvecl-{name}")
+    with tempfile.TemporaryDirectory() as folder:
+        path, make = Path(folder) / f"mauvecl-{name}.{ending}", tab.own_table
+        write_table(make(closed, answers) if make else answers[str(tab.files[name])].tables[name], path)
+        return path.name, path.read_bytes()
+
+
+def commands_and_programs(tab: Tab, question: FieldValues, folder: Path) -> list[dict[str, str]]:
+    """Return each of a tab's `questions` as a command and as a Python program; `folder` holds the visitor's files."""
+    entries = []
+    for name in tab.questions:
+        (verb, *_), study = QUESTIONS[name].verbs, QUESTIONS[name].study(question.case(folder).study)
+        # Paths relative to the study, instead of those on the server.
+        study, keys = with_paths(study, lambda file: Path(file.name)), dict[str, Any]()
+        for key, value in keys_used(VERBS[verb], study, Study()):
+            set_key(keys, key.split("."), value, key)
+        text = pformat(keys, width=100, sort_dicts=False).replace("\n", "\n    ")
+        # The command does so if a flare is given.
+        options = ", flaring=True" if verb == "simulate" else ""
+        program = PROGRAM.format(verb=verb, data=text, options=options)
+        entries.append({"question": name, "command": as_command(verb, study), "python": program})
+    return entries

@@ -20,6 +20,7 @@ import webbrowser
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,8 +40,8 @@ from mauvecl.schema.errors import InputError, printable, shortened
 from mauvecl.study.plan import TARGET_COLUMNS
 from mauvecl.web import fields
 from mauvecl.web.closed_forms import TITLES, ClosedForms
-from mauvecl.web.figures import INKS, PINS, Canvas
 from mauvecl.web.page import SEEN, SIMULATIONS, TABS, State, reads_of
+from mauvecl.web.tab import INKS, PINS, Canvas
 from mauvecl.web.uploads import EXAMPLES, MAPPED, TIME_UNITS, UPLOADS
 from mauvecl.web.visitor import READER, UNUSED, Job, Visitor, content_of, release_memory
 
@@ -207,6 +208,8 @@ def close_unused() -> None:
 
 def warm() -> None:
     """Prepare imports, response matrix, kernels and page before the first visitor."""
+    # A cancelled simulation may interrupt an import, and this one cannot be repeated.
+    import_module("scipy.signal")
     with tempfile.TemporaryDirectory() as folder:
         closed = ClosedForms.of(State().question(), Path(folder))
     for tab in TABS.values():

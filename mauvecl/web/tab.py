@@ -1,40 +1,31 @@
-"""Tabs of the page: the questions that they ask, their base class, and the tables and commands that they offer."""
+"""Base of the page's tabs: the questions that they ask, their tables, and their figures in both themes."""
 
 from __future__ import annotations
 
-import io
-import json
 import math
-import re
-import shlex
-import tempfile
-import threading
-import zipfile
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from pathlib import Path
-from pprint import pformat
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import BaseModel, TypeAdapter
+import numpy as np
+from bokeh import models
+from bokeh.models.annotations import ColorBar, Label, Span
+from bokeh.plotting import figure
 
-from mauvecl.answers.answer import write_table
 from mauvecl.answers.verbs import VERBS, Progress
+from mauvecl.charts import chart
+from mauvecl.host.arrays import true_runs
+from mauvecl.host.stars.flare import EmissionLine
 from mauvecl.schema.columns import View
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, metadata_of
-from mauvecl.schema.section import read_axis, read_line_fluxes, read_words
-from mauvecl.study.star import Star
-from mauvecl.study.study import Study, keys_of, set_key, with_paths
+from mauvecl.study.study import Study
 from mauvecl.web.closed_forms import OTHER
 from mauvecl.web.fields import FIELDS
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
-    from mauvecl.answers.verbs import Verb
-    from mauvecl.charts.chart import Chart
     from mauvecl.runs.pool import Pool
     from mauvecl.web.closed_forms import Answers, ClosedForms, FieldValues
 
@@ -46,14 +37,27 @@ INJECTED = {"of": "amplitude", "sizes": 12, "widths": 3, "count": 200, "position
 MOST_FITS, MOST_OF_TWO = 10_000, 1000
 DRAWN_UNITS = ("realisations", "steps", "cells")  # units of the progress of verbs that use the pool's devices
 FIXED = ("star", "amplitude")  # columns that the page does not show: its question has one star and one flare
-#: Keys that are stated even at their default, so that readers see what was assumed.
-STATED = ("star", "flare.amplitudes", "observation.exposure_s", "observation.instrument", "sky", "run.fap",
-          "run.realisations", "run.seed")  # fmt: skip
-#: Keys that verbs use without a flag for them, since everything that observes draws unknowns.
-ALWAYS_USED = ("nuisances.", "observation.temperature_c")
-MOST_CHARACTERS = 500  # longest value in a command; a longer one is in the study file
-ANYTHING = TypeAdapter(Any)
-_drawing = threading.Lock()  # held while matplotlib draws
+SHOWN_NM = (195.0, 705.0)  # wavelengths that are shown
+#: Spectral lines, and the Balmer jump at 4 / R_H with Rydberg's constant for hydrogen, nm in vacuum.
+MARKS = {name: EmissionLine.named(name).wavelengths_nm for name in ("Mg II", "Ca II", "H alpha")}
+MARKS["Balmer jump"] = (364.7,)
+MORE_MARKS = ("H alpha",)  # marks that are hidden by default
+#: Colours of the light and the dark theme by name, lighter on dark ground.
+INKS = {
+    "light": chart.INK,
+    "dark": {
+        "text": "#e6ebf1", "grid": "#34404d", "ground": "#182029", "star": "#56B4E9", "flare": "#FF8C42",
+        "sky": "#2fc79a", "drawn": "#9aa7b5", "dark": "#b99be0", "read": "#F0C040", "bias": "#E39BC9",
+        "total": "#e6ebf1", "threshold": "#e6ebf1", "own": "#ff6fa3", "shortest": "#FF8C42", "middle": "#FFBE8A",
+        "longest": "#FFE8D6",
+    },
+}  # fmt: skip
+#: Colours and dash patterns (lengths of dashes and gaps) of the lines of pinned scenarios, by theme.
+PINS = {
+    "light": (("#A21CAF", "6 3"), ("#7C4A03", "9 3 2 3"), ("#0E7490", "2 2")),
+    "dark": (("#F0ABFC", "6 3"), ("#D9AE76", "9 3 2 3"), ("#67E8F9", "2 2")),
+}
+TARGETS = ("star", "flare", "sky", "own", "dark", "read", "bias", "drawn")  # colours of several targets' curves
 
 
 def _map_around(study: Study) -> Study:
@@ -137,7 +141,7 @@ class Tab:
     name: str = ""
     title: str = ""
     about: str = ""  # what it shows, in a sentence
-    pictures: tuple[Chart, ...] = ()
+    pictures: tuple[chart.Chart, ...] = ()
     simulations: Mapping[str, str] = field(default_factory=dict)  # questions that its buttons simulate, with labels
     needs: str = ""  # field without which no simulation of it can start
     answer: str = ""  # name of the simulated answer whose table is below the pictures
@@ -201,144 +205,197 @@ class Tab:
         return [headings, *cells] if headings else []
 
 
-PROGRAM = """from mauvecl import Engine, Study, {verb}
+class Canvas:
+    """Empty figure of a chart, whose data sources have the names of the chart's data."""
 
-study = Study.build(
-    {data},
-    "page",
-)
-answer = {verb}(study, Engine(){options})
-print(next(iter(answer.tables.values())))
-"""
+    def __init__(self, picture: chart.Chart, theme: str, logs: frozenset[str]) -> None:
+        self.ink, self.picture = INKS[theme], picture
+        always = {name for name, axis in (("x", picture.x), ("y", picture.y)) if axis.log}
+        self.logs = logs | (always - {axis.lower() for axis in picture.logs})
+        self.plot = self._frame(picture.x, picture.y)
+        #: Entries of the legend: name, colour, form, and the tag that shows or hides each.
+        self.legend: list[tuple[str, str, str, str]] = []
+        if picture.x.kind == "wavelength":
+            self._mark()
+        # A line for each scenario that can be pinned is drawn as the series that it repeats.
+        pins = [
+            replace(item, called=f"pinned {k + 1}", name=f"pin {k}", colour=colour, dash=dash, width=2.0, show="pins",
+                    tips=(), listed=False)
+            for k, (colour, dash) in enumerate(PINS[theme]) for item in picture.series if item.key == picture.pins
+        ]  # fmt: skip
+        for series in sorted((*picture.series, *pins), key=lambda item: isinstance(item, chart.OwnMarker)):
+            self._add(series)
+
+    def _frame(self, x: chart.PlotAxis, y: chart.PlotAxis) -> Any:
+        """Return a figure with axes only."""
+        ranges = {f"{name}_range": bounds for name, axis in (("x", x), ("y", y)) if (bounds := self._range(name, axis))}
+        plot = figure(
+            x_axis_label=x.label,
+            y_axis_label=y.label,
+            x_axis_type="datetime" if x.kind == "dates" else "log" if "x" in self.logs else "linear",
+            y_axis_type="auto" if y.kind == "names" else "log" if "y" in self.logs else "linear",
+            sizing_mode="stretch_both",
+            min_height=60,
+            min_width=60,
+            min_border=2,
+            # Room for half of a label at the end of the axis, which Bokeh otherwise moves over its neighbour.
+            min_border_right=14,
+            # The wheel alone scrolls the page; two fingers zoom.
+            tools=[models.BoxZoomTool(), models.WheelZoomTool(modifiers={"ctrl": True}), models.ResetTool()],
+            active_scroll="auto",
+            toolbar_location=None,
+            background_fill_color=None,
+            border_fill_color=None,
+            outline_line_color=None,
+            **ranges,
+        )
+        text = self.ink["text"]
+        for axis in (*plot.xaxis, *plot.yaxis):
+            axis.update(
+                axis_label_text_font_style="normal", axis_label_text_font="system-ui", axis_label_text_font_size="12px",
+                axis_label_text_color=text, major_label_text_font="system-ui", major_label_text_font_size="11px",
+                major_label_text_color=text, axis_line_color=text, major_tick_line_color=text,
+                minor_tick_line_color=None, major_label_policy=models.NoOverlap(),
+            )  # fmt: skip
+            if isinstance(axis.formatter, models.BasicTickFormatter):
+                axis.formatter.power_limit_high = 7
+        plot.xaxis.name, plot.yaxis.name = "x axis", "y axis"
+        plot.grid.grid_line_color = self.ink["grid"]
+        plot.x_range.name, plot.y_range.name = "wavelength" if x.kind == "wavelength" else "x range", "y range"
+        return plot
+
+    def _range(self, name: str, axis: chart.PlotAxis) -> Any:
+        """Return the range of an axis, or None for Bokeh's own."""
+        if axis.kind == "wavelength":
+            # All figures with wavelengths share one range.
+            return models.Range1d(start=SHOWN_NM[0], end=SHOWN_NM[1], bounds=SHOWN_NM)
+        if axis.kind == "names":
+            return ["nothing"]
+        if axis.limits is not None:
+            return axis.log_limits if axis.log_limits is not None and name in self.logs else axis.limits
+        # Hidden marks do not affect the range; without data, the range is a default one.
+        return models.DataRange1d(only_visible=True, default_span=2.0) if name == "y" else None
+
+    def share_colours(self, title: str) -> models.LinearColorMapper:
+        """Add the colour bar of a share, and return its colours."""
+        text, mapper = self.ink["text"], models.LinearColorMapper(palette="Cividis256", low=0, high=1)
+        bar = ColorBar(
+            color_mapper=mapper, width=10, title=title, background_fill_color=None, major_label_text_color=text,
+            title_text_color=text, major_tick_line_color=text, title_text_font_style="normal",
+            title_text_font="system-ui", major_label_text_font="system-ui",
+        )  # fmt: skip
+        self.plot.add_layout(bar, "right")
+        return mapper
+
+    def _add(self, series: chart.Series) -> None:
+        """Add a series with its data source, entry of the legend, and tooltip."""
+        if isinstance(series, chart.Rule):
+            # Its position is set later.
+            dimension: Literal["height", "width"] = "height" if series.along == "x" else "width"
+            style: dict[str, Any] = {"line_color": self.ink.get(series.colour, series.colour), "line_dash": series.dash}
+            self.plot.add_layout(Span(dimension=dimension, location=None, name=series.key, **style))
+        if isinstance(series, chart.Rule | chart.LegendEntry):
+            self._list(series)
+            return
+        if isinstance(series, chart.Targets):
+            for k, colour in enumerate(TARGETS):
+                name = f"{series.key} {k}"
+                self._add(chart.Line(f"target {k + 1}", colour, name, width=2, dash=series.dash, tips=series.tips))
+            return
+        source = models.ColumnDataSource({column: [] for column in series.columns}, name=series.key)
+        if isinstance(series, chart.Custom):
+            if series.draw is not None:
+                series.draw(self, source)
+            return
+        renderer = self._drawn(series, source)
+        hidden = series.show in self.picture.shows
+        renderer.name, renderer.visible = series.called, not hidden
+        renderer.tags = [series.show] if hidden or series.show == "pins" else []
+        self._list(series)
+        if series.tips:
+            self.tooltips(renderer, *zip(series.tips, ("x", "y")[-len(series.tips) :], strict=True))
+        if isinstance(series, chart.Dots) and series.alone:
+            self.plot.y_range.update(renderers=[renderer])
+
+    def _drawn(self, series: chart.Series, source: models.ColumnDataSource) -> Any:
+        """Return the renderer of a series."""
+        plot, colour, columns = self.plot, self.ink.get(series.colour, series.colour), series.columns
+        line: dict[str, Any] = {
+            "line_color": colour, "line_width": series.width, "line_dash": series.dash or "solid",
+            "line_alpha": series.alpha,
+        }  # fmt: skip
+        fill: dict[str, Any] = {"source": source, "fill_color": colour, "fill_alpha": series.alpha}
+        match series:
+            case chart.Area():
+                return plot.varea(*columns, **fill)
+            case chart.Strips():
+                hatch = {"hatch_pattern": "/", "hatch_color": colour, "hatch_alpha": 0.5} if series.hatched else {}
+                return plot.vstrip(*columns, line_color=None, **fill, **hatch)
+            case chart.Bars():
+                return plot.quad("left", "right", "top", 1e-9 if "y" in self.logs else 0, line_color=None, **fill)
+            case chart.OwnMarker():
+                return plot.scatter(*columns, source=source, size=13, marker="circle", fill_color=colour,
+                                    line_color=self.ink["ground"], line_width=2)  # fmt: skip
+            case chart.Dots():
+                return plot.scatter(*columns, source=source, size=series.size, color=colour, marker=series.marker)
+            case chart.Contours():
+                if series.dash:
+                    # A bright edge sets pinned contours off from the map.
+                    plot.multi_line(*columns, source=source, line_color="#ffffff", line_width=5, tags=[series.show])
+                return plot.multi_line(*columns, source=source, **line)
+            case chart.Line(step=True):
+                return plot.step(*columns, source=source, mode="center", **line)
+        return plot.line(*columns, source=source, **line)
+
+    def _list(self, series: chart.Series) -> None:
+        """Add an entry to the legend."""
+        if series.listed:
+            form = "dash" if series.dash else series.form
+            self.legend.append((series.called, self.ink.get(series.colour, series.colour), form, series.show))
+
+    def tooltips(self, renderer: Any, *lines: tuple[str, str], along: Literal["hline", "vline"] = "vline") -> None:
+        """Add a tooltip with the name of a renderer and columns in four significant digits."""
+        columns = [column for _, column in lines]
+        rows = "".join(f"<div>{name}: <b>@{column}{{%.4g}}</b></div>" for name, column in lines)
+        target = renderer
+        if isinstance(renderer.glyph, models.Step):
+            # BokehJS finds no steps below the pointer.
+            target = self.plot.line("x", "y", source=renderer.data_source, line_alpha=0)
+        self.plot.add_tools(
+            models.HoverTool(
+                renderers=[target],
+                mode="mouse" if isinstance(renderer.glyph, models.Scatter) else along,
+                point_policy="snap_to_data",
+                line_policy="nearest",
+                tooltips=f"<b>{renderer.name}</b>{rows}",
+                formatters={f"@{column}": "printf" for column in columns},
+            )
+        )
+
+    def _mark(self) -> None:
+        """Add marks of spectral lines."""
+        colour = self.ink["text"]
+        for name, wavelengths_nm in MARKS.items():
+            hidden = name in MORE_MARKS
+            shared: dict[str, Any] = {"tags": ["more marks" if hidden else "marks"], "visible": not hidden}
+            line: dict[str, Any] = {"line_color": colour, "line_alpha": 0.35, "line_width": 1, "line_dash": "dotted"}
+            for nm in wavelengths_nm:
+                self.plot.add_layout(Span(dimension="height", location=nm, **line, **shared))
+            self.plot.add_layout(
+                Label(
+                    x=sum(wavelengths_nm) / len(wavelengths_nm), y=0, y_units="screen", y_offset=2, x_offset=3,
+                    text=name, angle=1.5708, text_font="system-ui", text_font_size="10px", text_color=colour,
+                    text_alpha=0.8, **shared,
+                )
+            )  # fmt: skip
 
 
-def differing(new: BaseModel, old: BaseModel, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the dotted path and the plain value of each key that has another value in `old`, or is `STATED`."""
-    for key, model_field in type(new).model_fields.items():
-        name, value, old_value = f"{path}{key}", getattr(new, key), getattr(old, key)
-        # A new sky replaces all keys of the old one, and so does a section with a flag of its own.
-        replaces = name == "sky" or bool(metadata_of(model_field, Flag))
-        if isinstance(value, BaseModel) and isinstance(old_value, BaseModel) and not replaces:
-            yield from differing(value, old_value, f"{name}.")
-        elif value is not None and (value != old_value or name in STATED):
-            # As TOML can hold it, without the defaults of records.
-            yield name, ANYTHING.dump_python(value, mode="json", exclude_defaults=True, exclude_none=True)
+#: Pixels that saturate, whose data `strips` returns.
+SATURATED = chart.Strips("saturated", "own", show="if any", alpha=0.18, hatched=True)
 
 
-def as_command(verb: str, study: Study) -> str:
-    """Return a question to a verb as a command, which names a study file if flags cannot say all of it."""
-    question, from_file = VERBS[verb], shlex.join(["mauvecl", verb, "study.toml"])
-    if any(file is not None for file in (study.flare.spectrum.file, *(star.file for star in study.star))):
-        return from_file
-    base = Study().with_settings([f"{key}={value}" for key, value in (question.defaults or {}).items()])
-    words = ["mauvecl", verb]
-    for name, value in keys_used(question, study, base):
-        if name == "data.file":
-            words.insert(2, value)
-        elif name == "star":
-            for star in value:
-                usual = Star(library=star.get("library"))
-                stated = {key: entry for key, entry in star.items() if entry != getattr(usual, key)}
-                words += _flag_words("star", {"library": usual.library} | stated, question)
-        elif name == "sky":
-            words += ["--sky", "none"] if value.get("none") else _flag_words("sky", value, question)
-        else:
-            # TOML on one line is JSON with another separator, and bare keys.
-            toml = json.dumps(value, ensure_ascii=False, separators=(", ", " = "))
-            toml = re.sub(r'"(\w+)" = ', r"\1 = ", toml, flags=re.ASCII)
-            words += _flag_words(name, value, question) or ["--set", f"{name}={toml}"]
-    return from_file if max(map(len, words)) > MOST_CHARACTERS else shlex.join(words)
-
-
-def keys_used(verb: Verb, study: Study, base: Study) -> Iterator[tuple[str, Any]]:
-    """Yield the keys that a verb uses of a study, with their plain values, if they are `differing` from a base."""
-    flagged = {key for key, *_ in keys_of()}
-    observes = verb.accepts("star.library")
-    for name, value in differing(study, base):
-        if name in ("star", "sky"):
-            used = observes if name == "star" else verb.accepts("sky.surface_brightness")
-        else:
-            used = verb.accepts(name) or name not in flagged or (observes and name.startswith(ALWAYS_USED))
-        if used:
-            yield name, value
-
-
-def _flag_words(name: str, value: Any, verb: Verb) -> list[str]:
-    """Return the words of the flag of a key, or of each key of a star or sky; none if no flag takes such a value."""
-    if name in ("star", "sky"):
-        return [word for key, inner in value.items() for word in _flag_words(f"{name}.{key}", inner, verb)]
-    for flag in (flag for key, _, flag in keys_of() if key == name and verb.accepts(name)):
-        if isinstance(value, bool) and flag.read is None:
-            on, _, off = flag.names[0].partition("/")
-            return [on] if value else [off] if off else []
-        if flag.read is read_line_fluxes:
-            return [word for line, share in value.items() for word in (flag.names[0], f"{line}={share!r}")]
-        if flag.read is read_axis and "start" in value:
-            spaced = [value["quantity"], *(_text(value[key]) for key in ("start", "stop", "steps"))]
-            return [flag.names[0], ":".join(spaced + ["log"] * value.get("log", False))]
-        if flag.read in (None, read_words):
-            values = value if isinstance(value, list) else [value]
-            if all(isinstance(item, str | int | float) for item in values):
-                return [word for item in values for word in (flag.names[0], _text(item))]
-    return []
-
-
-def _text(value: str | float) -> str:
-    """Return a value as it is typed, with every digit of a number."""
-    return value if isinstance(value, str) else str(value).removesuffix(".0")
-
-
-def study_file(study: Study, name: str) -> tuple[str, bytes]:
-    """Return name and content of the study file, in a zip archive with the visitor's files if there are any."""
-    # The visitor's files that the study names, each once.
-    files, text = dict[Path, Path](), study.toml()
-    with_paths(study, lambda file: files.setdefault(file, file))
-    if not files:
-        return f"{name}.toml", text.encode()
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
-        for file in files:
-            archive.write(file, file.name)
-            # Paths relative to the study, instead of those on the server.
-            text = text.replace(str(file.resolve()), file.name)
-        archive.writestr("study.toml", text)
-    return f"{name}.zip", out.getvalue()
-
-
-def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answers) -> tuple[str, bytes]:
-    """Return file name and content of one of a tab's `files` or `documents`, or of the study that reproduces it.
-
-    The ending is "ecsv", "fits" or "study", and empty for a document.
-    """
-    if name not in tab.documents and (name not in tab.files or ending not in ("ecsv", "fits", "study")):
-        raise InputError(f"{tab.title} has no file {name[:40]!r}.{ending[:10]}; use one of its own", key="name")
-    if not tab.offers(name, answers):
-        raise InputError(f"no {name} is computed yet: start a simulation first", key="name")
-    if name in tab.documents:
-        # Matplotlib's settings are those of the process.
-        with _drawing:
-            return name, answers[tab.documents[name]].documents[name]()
-    if ending == "study":
-        needed = tab.files[name]
-        return study_file(closed.case.study if needed is None else answers[needed].study, f"mauvecl-{name}")
-    with tempfile.TemporaryDirectory() as folder:
-        path, make = Path(folder) / f"mauvecl-{name}.{ending}", tab.own_table
-        write_table(make(closed, answers) if make else answers[str(tab.files[name])].tables[name], path)
-        return path.name, path.read_bytes()
-
-
-def commands_and_programs(tab: Tab, question: FieldValues, folder: Path) -> list[dict[str, str]]:
-    """Return each of a tab's `questions` as a command and as a Python program; `folder` holds the visitor's files."""
-    entries = []
-    for name in tab.questions:
-        (verb, *_), study = QUESTIONS[name].verbs, QUESTIONS[name].study(question.case(folder).study)
-        # Paths relative to the study, instead of those on the server.
-        study, keys = with_paths(study, lambda file: Path(file.name)), dict[str, Any]()
-        for key, value in keys_used(VERBS[verb], study, Study()):
-            set_key(keys, key.split("."), value, key)
-        text = pformat(keys, width=100, sort_dicts=False).replace("\n", "\n    ")
-        # The command does so if a flare is given.
-        options = ", flaring=True" if verb == "simulate" else ""
-        program = PROGRAM.format(verb=verb, data=text, options=options)
-        entries.append({"question": name, "command": as_command(verb, study), "python": program})
-    return entries
+def strips(wavelength_nm: Any, flags: Any) -> tuple[Any, Any]:
+    """Return the ends of runs of flagged pixels, half a pixel beyond each, as columns of `Strips`."""
+    first, end = true_runs(flags).T
+    half = 0.5 * np.gradient(wavelength_nm)
+    return (wavelength_nm - half)[first], (wavelength_nm + half)[end - 1]

@@ -224,7 +224,7 @@ class Upload:
 
     @property
     def options(self) -> dict[str, str]:
-        """Its `fields` by the reader's names, which are those of their keys."""
+        """Names of its `fields` by the options of the reader, which have the names of their keys."""
         return {FIELDS[name].path[-1]: name for name in self.fields}
 
     def read(self, name: str, content: bytes, values: Mapping[str, Any]) -> Any:

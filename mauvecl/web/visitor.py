@@ -33,11 +33,12 @@ from mauvecl.observations.frame_files import ColumnNames
 from mauvecl.runs.checkpoint import Stopped
 from mauvecl.runs.pool import LocalWorkers, Pool
 from mauvecl.schema.errors import InputError, shortened
+from mauvecl.web import page
 from mauvecl.web.closed_forms import ClosedForms, other_payloads, solved
 from mauvecl.web.fields import FIELDS, field_of, remedies, sentence
 from mauvecl.web.page import SIMULATIONS, TABS, State, card, known_values, reads_of
 from mauvecl.web.sandboxed_reader import EXPECTED_FRAMES, read_limited
-from mauvecl.web.tab import DRAWN_UNITS, QUESTIONS, as_file, commands_and_programs, simulate, study_file
+from mauvecl.web.tab import DRAWN_UNITS, QUESTIONS, simulate
 from mauvecl.web.uploads import RESULTS, UPLOAD_SHELF, UPLOADS
 
 if TYPE_CHECKING:
@@ -377,7 +378,7 @@ class Visitor(WebSocketHandler):
             return
         if self._drawing is not None:
             self._drawing.cancel()
-        options = closed.case.draw_options | {"seed": closed.case.study.run.seed}
+        options = closed.case.draw_options | {"seed": closed.study.run.seed}
         job = self._drawing = Job(lambda pool: pool.realise(closed.flare, count=1, **options)[0])
         try:
             spectrum = await asyncio.wrap_future(job.future)
@@ -400,7 +401,7 @@ class Visitor(WebSocketHandler):
             raise InputError("a simulation is running already: wait until it ends")
         main, *more = QUESTIONS[kind].verbs
         unit = VERBS[main].counts
-        ask = partial(simulate, kind, closed.case.study, inputs=closed.inputs)
+        ask = partial(simulate, kind, closed.study, inputs=closed.inputs)
         # Several verbs count the realisations of all in the pool.
         job = self.job = Job(ask, unit in DRAWN_UNITS, "" if more else unit)
         answers = asyncio.wrap_future(job.future)
@@ -466,14 +467,14 @@ class Visitor(WebSocketHandler):
 
         def make() -> tuple[str, bytes]:
             if (tab := TABS.get(request.tab)) is not None:
-                return as_file(tab, name, request.ending, self.closed(state, tab), self.answers(state))
+                return page.as_file(tab, name, request.ending, self.closed(state, tab), self.answers(state))
             # The page asks for the study of a question by its name alone.
             tab = next((tab for tab in TABS.values() if name in tab.questions), None)
             if tab is None:
                 raise InputError(f"no tab asks {name[:40]!r}; give a question of a tab")
             # A simulation asks what its own answers depend on, which their tables state.
             question = state.question(reads_of(name) if name in SIMULATIONS else tab.reads)
-            return study_file(QUESTIONS[name].study(question.case(self._folder).study), "study")
+            return page.study_file(QUESTIONS[name].study(question.case(self._folder).study), "study")
 
         file, content = await asyncio.to_thread(make)
         self.send(content, n=request.n, file=file)
@@ -481,7 +482,7 @@ class Visitor(WebSocketHandler):
     async def _ask_export(self, request: Request) -> None:
         """Send a tab's questions as commands and as Python programs."""
         question = self.state(request.link).question(request.front.reads)
-        taken = await asyncio.to_thread(commands_and_programs, request.front, question, self._folder)
+        taken = await asyncio.to_thread(page.commands_and_programs, request.front, question, self._folder)
         self.send(n=request.n, taken=taken)
 
 

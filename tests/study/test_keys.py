@@ -80,6 +80,9 @@ def test_keys_sweeps_maps_and_arguments_have_the_range(name: str) -> None:
     for value in ends(name):
         swept = Study().with_settings([f"sweep.axes=[{{quantity={name!r},values=[{value!r}]}}]"])
         assert swept.sweep.axes[0].points() == (value,)
+        for start, log in product(np.linspace(*ends(name), 40)[1:-1].tolist(), (False, True)):
+            axis = {"quantity": name, "start": start, "stop": value, "steps": 2, "log": log and min(start, value) > 0}
+            assert Study.build({"sweep": {"axes": [axis]}}, "test").sweep.axes[0].points()[-1] == value
         assert name == "line_scale" or not refuses(lambda: CALLS[name](value))  # noqa: B023
 
 

@@ -5,6 +5,8 @@ import json
 import re
 import signal
 import socket
+import subprocess
+import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -319,6 +321,11 @@ def test_invented_figures_are_not_kept_in_memory() -> None:
         with pytest.raises(HTTPError, match="404"):
             server.figure("light", name, "")
     assert server.figure.cache_info().currsize == 0
+
+
+def test_scipy_is_imported_before_a_simulation_is_cancelled_meanwhile() -> None:
+    code = "import sys; from mauvecl.web import server; server.warm(); sys.exit('scipy.signal' not in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.long
