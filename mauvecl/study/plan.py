@@ -227,8 +227,8 @@ def targets_of(orbit: OrbitQuestion, plan: PlanQuestion) -> list[Target]:
     targets = [Target.of(text, simbad=orbit.simbad) for text in orbit.targets]
     targets = targets or [target.target(orbit.simbad) for target in plan.targets]
     if not targets:
-        fault = "there are no targets; give names or coordinates, such as `orbit.targets='eps Eri'`"
-        raise InputError(fault, key="orbit.targets")
+        remedy = "give names or coordinates, such as `look_at='eps Eri'` or orbit.targets=['eps Eri'] in a study"
+        raise InputError(f"there are no targets; {remedy}", key="orbit.targets")
     check_different([target.name for target in targets], "the target", "orbit.targets")
     return targets
 
