@@ -58,7 +58,7 @@ def _spectrum(path: Path, case: Case) -> tuple[str, ...]:
 
 
 def _frames(path: Path, case: Case) -> tuple[str, ...]:
-    frames = read_frames(path, mapping_of(case, path.parent), **case.get("options", {}))
+    frames = read_frames(f"{path}{case.get('part', '')}", mapping_of(case, path.parent), **case.get("options", {}))
     rows = value(case.get("kept", "every"))
     time, flux = value(case.get("time", "t"))[rows], value(case.get("light", "light"))[rows]
     assert (frames.reference_mjd is None) == ("mjd" not in case)

@@ -322,7 +322,8 @@ class FitsTables(TableFile):
     """An open FITS file.
 
     The columns of an extension, by its name or number, are searched first; by default those of the first table with a
-    column of each of the `groups` of names, or else of the first table.
+    column of each of the `groups` of names, or else of the first table. Next to an extension that has no columns, such
+    as an image, only images and ``EXTENSION/COLUMN`` are found.
     """
 
     def __init__(
@@ -336,9 +337,12 @@ class FitsTables(TableFile):
         fitting = [k for k in self.tables if all(lower[k] & {title.lower() for title in group} for group in groups)]
         at = None if name is None else self._number(name)
         if name is not None and at is None:
-            extensions = ", ".join(map(self._label, range(len(hdus))))
+            extensions = ", ".join(map(self._label, self.tables or range(len(hdus))))
             raise InputError.of("hdu", name, f"one of {extensions}", where=label)
-        self.chosen = at if at in self.tables else next(iter(fitting or self.tables), None)
+        #: Name of an extension without columns that is chosen instead of a table; empty for others.
+        self.columnless = "" if name is None or at in self.tables or not self.tables else name
+        by_default = None if self.columnless else next(iter(fitting or self.tables), None)
+        self.chosen = at if at in self.tables else by_default
         header: dict[str, Any] = {}
         for number in (0, at, self.chosen):
             header |= {} if number is None else dict(hdus[number].header)
@@ -357,10 +361,18 @@ class FitsTables(TableFile):
         if column and (number := self._number(extension)) in self.tables:
             return self.column(number, column)
         columns = [values for k in self.tables if (values := self.column(k, name)) is not None]
+        if columns:
+            self.check_choice()
         if len(columns) > 1:
             fault = f"{self.label} has {len(columns)} columns called {name!r}"
             raise InputError(f"{fault}; give EXTENSION/COLUMN", key=name)
         return columns[0] if columns else None
+
+    def check_choice(self) -> None:
+        """Raise InputError if the chosen extension has no columns, although others have."""
+        if self.columnless:
+            expected = f"an extension with a table ({', '.join(map(self._label, self.tables))})"
+            raise InputError.of("hdu", self.columnless, expected, where=self.label)
 
     def axis(self, name: str, dimension: int) -> Values:
         """Return the coordinates along an axis of an image, dimension 1 being that of pixels."""

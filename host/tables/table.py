@@ -273,6 +273,9 @@ class TableFile(ABC):
     def named(self, name: str) -> Values | None:
         """Return the values of a name, or None."""
 
+    def check_choice(self) -> None:  # noqa: B027
+        """Raise InputError if what is chosen of the file has no columns; files with a single table have no choice."""
+
     def find(self, name: str) -> Values:
         """Return the values of a name, or of the columns that a pattern such as ``flux_*`` fits, side by side."""
         values = self.named(name)

@@ -559,7 +559,8 @@ def plan(
     [100.0]
     """
     if not study.plan.targets:
-        raise InputError("the plan needs targets, such as `plan.targets='targets.csv'`", key="plan.targets")
+        in_study = "plan.targets=['eps Eri'] in a study"
+        raise InputError(f"the plan needs targets, such as `targets='targets.csv'` or {in_study}", key="plan.targets")
     if study.orbit.targets:
         raise InputError("both orbit.targets and plan.targets are given; use plan.targets alone", key="orbit.targets")
     if completeness is None and study.plan.completeness == "closed form":

@@ -182,9 +182,22 @@ def _open_frames(
             open_file = partial(_open_file, name=name, check=check)
             opened = nullcontext(stored.FolderFile(place, mapping, label, open_file))
         with opened as file:
+            _check_selection(file, words)
             if mapping is None:
                 mapping = file.mapping(raw) if isinstance(file, stored.StoredFile) else recognised(file)
             yield file, mapping, place.stem
+
+
+def _check_selection(file: TableFile, words: tuple[str, ...]) -> None:
+    """Raise InputError for words in brackets that do not select one part of a file.
+
+    An extension or array that does not exist, or has no columns, is refused when the file is read.
+    """
+    has_parts = isinstance(file, FitsTables | stored.StoredFile | stored.FolderFile)
+    if len(words) > int(has_parts):
+        remedy = "give one extension or array" if has_parts else "give the file alone, which has a single table"
+        part = shortened(",".join(words))
+        raise InputError(f"{file.label}: {part} in brackets selects no single part of it; {remedy}", key="hdu")
 
 
 def _open_file(

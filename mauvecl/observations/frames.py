@@ -183,7 +183,8 @@ def _with_mjd(reference: Any, scale: str) -> dict[str, Any]:
 
     with offline(), contextlib.suppress(ValueError):
         moment = reference if isinstance(reference, Time) else Time(text, scale="utc")
-        return {"reference_mjd": float(getattr(moment, scale).mjd), "scale": scale}
+        # A time that is masked in a table is none.
+        return {"reference_mjd": float(np.ma.filled(getattr(moment, scale).mjd, np.nan)), "scale": scale}
     return {}
 
 

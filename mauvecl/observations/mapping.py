@@ -142,6 +142,7 @@ DATE = "a number or a date such as 2026-03-01T12:00:00"
 
 def recognised(file: TableFile) -> FrameMapping:
     """Return the mapping of a file whose columns have known names."""
+    file.check_choice()
     # FITS files also have images, and columns of other extensions, which do not count.
     names = [*file.columns, *(name for name in file.names if "/" not in name and name not in file.columns)]
     columns: dict[str, Any] = {key: first_of(usual, names, file.label) for key, usual in COLUMN_NAMES.items()}

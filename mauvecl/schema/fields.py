@@ -117,8 +117,13 @@ def is_date(value: Any) -> bool:
 
 def is_table(value: Any) -> bool:
     """Return whether a value is a table of astropy or a DataFrame."""
-    # A row of a table has the columns of the table, which it names.
-    return hasattr(value, "columns") and not hasattr(value, "table")
+    # A row of a table has the columns of the table.
+    return hasattr(value, "columns") and not is_row(value)
+
+
+def is_row(value: Any) -> bool:
+    """Return whether a value is a row of a table of astropy, which it names."""
+    return hasattr(value, "columns") and hasattr(value, "table")
 
 
 Metadata = TypeVar("Metadata")

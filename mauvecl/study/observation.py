@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, create_model, model_validator
+from pydantic import AfterValidator, ValidationInfo, create_model, field_validator, model_validator
 
 from mauvecl.detection import DEFAULT_STATISTICS, RECOMMENDED, STATISTIC_NAMES, Tails
 from mauvecl.host.exposure import DEFAULT_SKY
@@ -97,6 +97,18 @@ class Observation(Section):
         return instrument.with_(**changes) if changes else instrument
 
 
+def utc_time(cls: type[Section], text: str | None, info: ValidationInfo) -> str | None:
+    """Return the text of a key that is a time, or its default, for which astropy need not be loaded."""
+    key = str(info.field_name)
+    if text is not None and text != cls.model_fields[key].default:
+        from mauvecl.host.exposure.background import parse_time
+        from mauvecl.host.tables.units import offline
+
+        with offline():
+            parse_time(text, key)
+    return text
+
+
 class SkyLight(Section):
     """Sky background: a surface brightness, that of a target at a time, or none."""
 
@@ -128,6 +140,8 @@ class SkyLight(Section):
         hint="Such as 2026-09-01T12:00.",
     )
     none: bool = setting(False, "Whether there is no sky")
+
+    _time = field_validator("time")(utc_time)
 
     @model_validator(mode="before")
     @classmethod

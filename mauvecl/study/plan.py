@@ -17,6 +17,7 @@ from mauvecl.schema import fields
 from mauvecl.schema.errors import InputError, shortened, shown
 from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit, first
 from mauvecl.schema.section import Section, built, check_all, check_different, check_one, number_or_text, setting
+from mauvecl.study.observation import utc_time
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -58,17 +59,7 @@ class OrbitQuestion(Section):
     simbad: bool = setting(False, "Ask SIMBAD for names that are not embedded; needs mauvecl[names]", flag="--simbad")
     limits: Limits = Limits()
 
-    @field_validator("start")
-    @classmethod
-    def _time(cls, text: str) -> str:
-        # The default is a time, for which astropy need not be loaded.
-        if text != cls.model_fields["start"].default:
-            from mauvecl.host.exposure.background import parse_time
-            from mauvecl.host.tables.units import offline
-
-            with offline():
-                parse_time(text, "start")
-        return text
+    _time = field_validator("start")(utc_time)
 
     def _check_values(self) -> None:
         if self.step_s > self.days * fields.DAY_S:
@@ -235,8 +226,8 @@ def targets_of(orbit: OrbitQuestion, plan: PlanQuestion) -> list[Target]:
     targets = [Target.of(text, simbad=orbit.simbad) for text in orbit.targets]
     targets = targets or [target.target(orbit.simbad) for target in plan.targets]
     if not targets:
-        fault = "there are no targets; give names or coordinates, such as `orbit.targets='eps Eri'`"
-        raise InputError(fault, key="orbit.targets")
+        remedy = "give names or coordinates, such as `look_at='eps Eri'` or orbit.targets=['eps Eri'] in a study"
+        raise InputError(f"there are no targets; {remedy}", key="orbit.targets")
     check_different([target.name for target in targets], "the target", "orbit.targets")
     return targets
 

@@ -26,8 +26,8 @@ from mauvecl.host.tables import files
 from mauvecl.noise.unknowns import NONE, NUISANCES, Processes
 from mauvecl.schema.calls import checked, validated
 from mauvecl.schema.errors import InputError, Message, shortened
-from mauvecl.schema.fields import AnyUnit, Flag, Help, Unit, as_quantity, is_table, metadata_of
-from mauvecl.schema.section import Section, built, fields_of, read_assignment, setting
+from mauvecl.schema.fields import AnyUnit, Flag, Help, Unit, as_quantity, is_row, is_table, metadata_of
+from mauvecl.schema.section import Section, built, fields_of, model_in, read_assignment, setting
 from mauvecl.study import questions
 from mauvecl.study.observation import NuisanceChoice, Observation, Run, SkyLight, Unknowns
 from mauvecl.study.plan import OrbitQuestion, PlanQuestion, PlanTarget
@@ -455,7 +455,15 @@ class Keyword(NamedTuple):
         return get_args(self.kind)[0] if self.many else self.kind
 
     def value(self, value: Any) -> Any:
-        """Convert a value of the kind that the command line takes to that of the key; return others unchanged."""
+        """Convert a value of the kind that the command line takes to that of the key; return others unchanged.
+
+        A single record of a list, such as a target, is a list of one: keys of it, a row of a table, or a position.
+        """
+        records = get_origin(self.field.annotation) is tuple and model_in(self.field.annotation) is not None
+        if records and is_row(value):
+            value = value.table[value.index : value.index + 1]
+        elif records and (isinstance(value, Mapping) or (hasattr(value, "icrs") and not getattr(value, "ndim", 0))):
+            value = [value]
         kinds = {str: (str,), Path: (str, Path)}.get(self.item_kind, (str, int, float))
         is_read = all(isinstance(item, kinds) for item in (value if self.many else [value]))
         # Readers of files also take tables in memory.
@@ -493,7 +501,7 @@ def values_of(values: Mapping[str, Any], keywords: Mapping[str, Keyword], where:
         raise InputError(f"{where} has no keyword {name!r}; use a flag of the command, such as {', '.join(near)}")
     by_name = {name: values.get(name) for name in keywords}
     for name, value in by_name.items():
-        if keywords[name].many and is_table(value):
+        if keywords[name].many and (is_table(value) or is_row(value)):
             raise InputError.of(name, value, "a value or a list of values")
         if keywords[name].many and value is not None and not isinstance(value, Mapping):
             # Neither a sequence nor an array.

@@ -123,6 +123,8 @@ def test_studies_are_built_from_and_changed_by_the_same_keywords() -> None:
     table = QTable({"name": ["AU Mic", "X"], "place": places, "amplitude": [0.1, 0.2]})
     of_table = Study.of(targets=table, flares=table["name", "amplitude"])
     assert [target.coordinates for target in of_table.plan.targets] == ["10.5 -20.0", "20.0 5.0"]
+    single = {"10.500000 -20.000000": places[0], "X": table[1], "EK Dra": {"name": "EK Dra"}}
+    assert [Study.of(targets=one).plan.targets[0].name for one in single.values()] == [*single]
     assert of_table.flare.amplitudes == (0.1, 0.2)
     assert Study.of(look_at=[places[0], "AU Mic"]).orbit.targets == ("10.500000 -20.000000", "AU Mic")
     assert Study.of(look_at=places).orbit.targets == ("10.500000 -20.000000", "20.000000 5.000000")

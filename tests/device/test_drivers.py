@@ -224,10 +224,11 @@ STEPS = [set(), {"ssse3", "cx16"}, V2, AVX, AVX | {"f16c"}, V3, V4]
 
 def test_highest_level_has_all_its_instructions_and_vectors_as_wide_as_those_of_library() -> None:
     """Compare the register widths of the library and of the kernels, which must agree to pass vectors."""
-    for flags, level in (
-        (set(), "x86-64"), (V2, "x86-64-v2"), (AVX, "sandybridge"), (V3 - {"fma"}, "sandybridge"),
-        (V3 | {"avx512f"}, "x86-64-v3"), (V4, "x86-64-v4"), (V4 - {"popcnt"}, "x86-64"),
-    ):  # fmt: skip
+    steps = (set(), V2, AVX, V3, V4)
+    for level, flags, higher in zip(drivers.LEVELS, steps, (*steps[1:], V4), strict=True):
+        for missing in higher - flags or {""}:
+            # A processor without one of the instructions that the next level adds.
+            assert drivers.levels(frozenset(V4 - {missing}))[0] == level, missing
         assert drivers.levels(frozenset(flags))[0] == level, flags
     passed = {"sse2": 128, "ssse3": 128, "sse41": 128, "avx": 256, "avx_f16c": 256, "avx2": 256, "avx512": 512}
     for flags in STEPS:
