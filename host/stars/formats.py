@@ -189,7 +189,7 @@ _AXIS_NAME = re.compile(r"(?:(.+)_)?(?:WAVELENGTH|WAVE|WAVELEN|LAMBDA|LOGLAM)", 
 _FLUX_NAMES = ("FLUX", "SCI", "SPECTRUM", "SPEC")
 
 
-class _Reader:
+class _FitsReader:
     """Reader of the tables of an open FITS file, including images of spectra."""
 
     def __init__(self, hdus: Any, name: str, origin: str, words: Sequence[str]) -> None:
@@ -407,7 +407,7 @@ def read_spectrum(
             if form == "FITS":
                 hdus = open_fits(content, check=not ignore_checksum)
                 with reading("it", WHOLE):
-                    tables = _Reader(hdus, name, origin, words).tables()
+                    tables = _FitsReader(hdus, name, origin, words).tables()
             elif form == "VOTable":
                 tables = []
                 for number, table in enumerate(votables(content.read(), "it"), 1):

@@ -93,7 +93,7 @@ def limit_bytes(variable: str) -> int:
 
 
 def check_content(n_bytes: int, sentence: str) -> None:
-    """Raise InputError if content is larger than MAUVECL_LARGEST_CONTENT_MIB, which the end of its sentence states."""
+    """Raise InputError with a sentence, which ends with the limit, above MAUVECL_LARGEST_CONTENT_MIB of content."""
     limit = "MAUVECL_LARGEST_CONTENT_MIB"
     if n_bytes > (most := limit_bytes(limit)):
         raise InputError(f"{sentence} {most >> 20} MiB; {limit} sets the limit", key=limit)
@@ -154,7 +154,7 @@ def _check_n_bytes(n_bytes: int, path: Path, kind: str, most: int | None = None)
 
 
 def check_folder(path: Path, kind: str) -> None:
-    """Raise InputError for files that another library should not read: devices, and too large ones."""
+    """Raise InputError for files that other libraries should not read: devices, large files, JSON above its limit."""
     for folder, _, names in os.walk(path):
         for name in names:
             file = Path(folder) / name
