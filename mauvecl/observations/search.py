@@ -14,7 +14,7 @@ threshold solves only those that can exceed it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -137,11 +137,10 @@ class ProcessSearch:
             values = np.asarray(sums[:, :, k], np.float64)
             level = (values @ weights) / weights.sum()
             scores[:, k, self.at] = covariance.solve(values.T).T - level[:, None] * weights
-        correlations = Correlations(scores, max(max(row.shape.size, abs(row.first)) for row in filters))
+        correlate = _correlator(scores, max(max(row.shape.size, abs(row.first)) for row in filters))
 
         def search_row(row: Filter) -> tuple[Filter, Float]:
-            correlated = correlations.with_kernel(row.shape, row.first)[..., row.peaks]
-            rho = np.einsum("dk,sko->sdo", self.bank.directions, correlated)
+            rho = np.einsum("dk,sko->sdo", self.bank.directions, correlate(row.shape, row.first)[..., row.peaks])
             if above is not None:
                 # A template of which a smaller share lies in frames is not searched.
                 self._solve(row, (rho[0] > above * np.sqrt(LEAST_SHARE * row.without_gaps)).any(axis=0))
@@ -248,27 +247,25 @@ def _regular_solution(process: Process, variance: float, frame_s: float, shape: 
     return covariance.solve(np.column_stack([shape, single]))
 
 
-class Correlations:
-    """Correlations of light curves with kernels up to a largest reach, which share the transform of the light curves.
+def _correlator(values: Float, reach: int) -> Callable[[Float, int], Float]:
+    """Return a function that correlates light curves with kernels up to a reach, which share their transform.
 
-    Values beyond the ends of the last axis are zero.
+    Of a kernel and its first frame it returns sum_k values[o + first + k] kernel[k] for every frame o of the last axis;
+    values beyond the ends of this axis are zero.
     """
+    size = next_fast_len(values.shape[-1] + 2 * reach, real=True)
+    spectrum = rfft(np.pad(values, [(0, 0)] * (values.ndim - 1) + [(reach, 0)]), size)
 
-    def __init__(self, values: Float, reach: int) -> None:
-        self.values, self._reach = values, reach
-        self._size = next_fast_len(values.shape[-1] + 2 * reach, real=True)
-        self._spectrum = rfft(np.pad(values, [(0, 0)] * (values.ndim - 1) + [(reach, 0)]), self._size)
+    def correlate(kernel: Float, first: int) -> Float:
+        correlated = irfft(spectrum * rfft(kernel, size).conj(), size)
+        return correlated[..., reach + first : reach + first + values.shape[-1]]
 
-    def with_kernel(self, kernel: Float, first: int) -> Float:
-        """Return sum_k values[o + first + k] kernel[k] for every frame o of the last axis."""
-        start = self._reach + first
-        correlated = irfft(self._spectrum * rfft(kernel, self._size).conj(), self._size)
-        return correlated[..., start : start + self.values.shape[-1]]
+    return correlate
 
 
 def _correlate(values: Float, kernel: Float, first: int) -> Float:
-    """Return the correlation of values with a single kernel; see `Correlations`."""
-    return Correlations(values, max(abs(first), kernel.size)).with_kernel(kernel, first)
+    """Return the correlation of values with a single kernel; see `_correlator`."""
+    return _correlator(values, max(abs(first), kernel.size))(kernel, first)
 
 
 #: Step between half-widths of a bank: the same as that of `flares.HALF_WIDTHS_S`.
