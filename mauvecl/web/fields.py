@@ -234,21 +234,20 @@ class Field(Widget):
         return self.own_keys or (".".join(self.path),)
 
 
-def _name(key: str, field: FieldInfo, widget: Widget) -> str:
-    """Return the name of the field of a key, such as "exposure_s", or "change_band" as in the flag --change-band."""
-    name = key.rpartition(".")[2]
-    with_section = f"{key.partition('.')[0]}_{name}"
-    has_section = any(with_section.startswith(flag.parameter) for flag in metadata_of(field, Flag))
-    return widget.name or (with_section if has_section else name)
-
-
 def _field(key: str, field: FieldInfo, widget: Widget) -> Field:
-    """Return the field of a key from its metadata."""
-    section = key.rpartition(".")[0]
+    """Return the field of a key from its metadata.
+
+    Its name is that of the key, as in "exposure_s", or "change_band" if a flag is named so as well.
+    """
+    section, _, name = key.rpartition(".")
+    with_section = f"{key.partition('.')[0]}_{name}"
+    if any(with_section.startswith(flag.parameter) for flag in metadata_of(field, Flag)):
+        name = with_section
     default, unit, flag = field.get_default(), first(field, Unit) or Unit(""), first(field, Flag) or Flag("")
     text = as_typed(default * widget.scale if isinstance(default, float) else default, truth=("no", "yes"))
     optional = text == "" if widget.first is None else not widget.first
     texts = {
+        "name": widget.name or name,
         "label": widget.label or flag.label,
         "group": next((HEADINGS[place] for place in (key, section) if place in HEADINGS), ""),
         "first": text if widget.first is None else widget.first,
@@ -339,13 +338,10 @@ _OWN_FIELDS = {
         "(importance sampling) needs fewer.", group="Detection", place=2, own_keys=("run.realisations", "run.tails"),
     ),
 }  # fmt: skip
-_KEYS = {
-    _name(key, field, widget): _field(key, field, widget)
-    for key, field in study_keys().items()
-    for widget in metadata_of(field, Widget)
-}
+_KEYS = [_field(key, field, widget) for key, field in study_keys().items() for widget in metadata_of(field, Widget)]
 #: Fields by name, as in links and in `FieldValues`; the default is a flare at the edge of detection.
-FIELDS = dict(sorted((_OWN_FIELDS | _KEYS).items(), key=lambda item: item[1].place))
+FIELDS = _OWN_FIELDS | {field.name: field for field in _KEYS}
+FIELDS = dict(sorted(FIELDS.items(), key=lambda item: item[1].place))
 
 
 def _group(name: str) -> tuple[str, ...]:
