@@ -127,7 +127,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "a shard's flares from the first": (
         "test_shards_of_stares_join_to_the_same_bits[None-cumulants]",
-        ("request.flares.part(few.begin - request.start,", "request.flares.part(done,"),
+        ("request.flares.part(piece.begin - request.start,", "request.flares.part(done,"),
     ),
     "a shard under another's name": (
         "test_interrupted_run_is_resumed_whatever_happens_to_its_files[misplaced]",
@@ -282,7 +282,7 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     "shifts forgotten in the closed form": (
         "test_few_terms_and_far_tails_agree_with_scipy",
-        ("(0.5 * (turn - log))[..., 0]", "(-0.5 * log)[..., 0]"),
+        ("(0.5 * (shifted - log))[..., 0]", "(-0.5 * log)[..., 0]"),
     ),
     "one smoothed value in four dropped": (
         "test_nominal_payload_is_gaussian",

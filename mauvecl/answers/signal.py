@@ -434,7 +434,7 @@ def coverage(result: SnrResult) -> Float:
     width = 2.0 ** observers["bin_shift"].astype(float)
     shares = np.empty(signal.size)
     for p in range(signal.size):
-        filled, counts = result.counts.bins["pixel"].of(p)
+        filled, counts = result.counts.bins["pixel"].in_row(p)
         edges = width[p] * np.column_stack([filled, filled + 1]).ravel() - 0.5
         edges += float(observers["net_offset"][p])
         ends = np.interp([low[p], high[p]], edges, steps_of(counts) / result.counts.n)

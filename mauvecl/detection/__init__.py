@@ -33,21 +33,21 @@ class NoThresholdError(InputError):
     """A false-alarm probability that no threshold of a statistic has."""
 
 
-def check_atom(what: str, fap: float, beyond: float, at: float) -> None:
+def check_atom(subject: str, fap: float, above: float, at_threshold: float) -> None:
     """Raise NoThresholdError if a single value of a statistic is more probable than a false-alarm probability.
 
-    This happens if saturation gives many exposures the same counts. `what` names the statistic and the star; `beyond`
-    is the probability of values above the threshold, and `at` that of the threshold itself.
+    This happens if saturation gives many exposures the same counts. `subject` names the statistic and the star;
+    `above` is the probability of values above the threshold, and `at_threshold` that of the threshold itself.
     """
-    if at <= fap:
+    if at_threshold <= fap:
         return
-    exist = [f"at most {_rounded(beyond, math.floor):g}"] if beyond > 0 else []
-    if beyond + at < 1.0:
-        exist.append(f"{_rounded(beyond + at, math.ceil):g} and more")
+    possible = [f"at most {_rounded(above, math.floor):g}"] if above > 0 else []
+    if above + at_threshold < 1.0:
+        possible.append(f"{_rounded(above + at_threshold, math.ceil):g} and more")
     raise NoThresholdError(
-        f"no threshold of {what} has a false-alarm probability of {fap:g}: {100 * at:.3g} % of exposures without a "
-        "flare give one and the same value, as saturated pixels do, and either all of them or none are alarms; use a "
-        f"false-alarm probability that a threshold has: {' or '.join(exist) or 'none'}",
+        f"no threshold of {subject} has a false-alarm probability of {fap:g}: {100 * at_threshold:.3g} % of exposures "
+        "without a flare give one and the same value, as saturated pixels do, and either all of them or none are "
+        f"alarms; use a false-alarm probability that a threshold has: {' or '.join(possible) or 'none'}",
         key="fap",
     )
 

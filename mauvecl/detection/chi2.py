@@ -48,18 +48,21 @@ class Chi2(Statistic):
         true, scatter = seen.variance * setting.used, seen.scatter
         model = true if seen.estimated else self.variance(setting) * setting.used
         delta, model, true = (self._grouped(setting, values) for values in (seen.mean, model, true))
-        counts = (model > 0) & (true > 0)
-        delta, model, true = delta[counts], model[counts], true[counts]
+        counted = (model > 0) & (true > 0)
+        delta, model, true = delta[counted], model[counted], true[counted]
         if setting.nuisances:
             if scatter is not None:
-                scatter = self._grouped(setting, scatter * setting.used)[:, counts]
-            return self._marginal_form(setting, counts, (delta, model, true), scatter)
+                scatter = self._grouped(setting, scatter * setting.used)[:, counted]
+            return self._marginal_form(setting, counted, (delta, model, true), scatter)
         return QuadraticForm(true / model, delta / np.sqrt(true))
 
     def _marginal_form(
-        self, setting: Setting, counts: NDArray[np.bool_], moments: tuple[Float, Float, Float], scatter: Float | None
+        self, setting: Setting, counted: NDArray[np.bool_], moments: tuple[Float, Float, Float], scatter: Float | None
     ) -> QuadraticForm:
-        """Return the distribution of x^T C^-1 x for normal x with some mean, model's and true variance, and scatter."""
+        """Return the distribution of x^T C^-1 x for normal x.
+
+        `counted` masks the terms of x, and `moments` are the mean, model's variance and true variance of those counted.
+        """
         nuisances, (delta, model, true) = setting.nuisances, moments
         assert nuisances is not None
         if scatter is None and not delta.any() and np.array_equal(model, true):
@@ -67,12 +70,12 @@ class Chi2(Statistic):
         scale = np.sqrt(model)
 
         def projection() -> tuple[Float, Float]:
-            spectra = self._grouped(setting, nuisances.spectra * setting.used)[:, counts]
+            spectra = self._grouped(setting, nuisances.spectra * setting.used)[:, counted]
             return spectra, nuisances.rows(model, spectra) * scale
 
         # The nodes of an integral over drawn factors share the model's variances.
-        pixels = np.packbits(counts).tobytes().hex()
-        spectra, rows = setting.cached(f"projection of {self.name} on {pixels}", projection)
+        terms = np.packbits(counted).tobytes().hex()
+        spectra, rows = setting.cached(f"projection of {self.name} on {terms}", projection)
         drawn = (nuisances.finite(spectra) if scatter is None else scatter) / scale
         ratio, moved = true / model, delta / scale
         groups, outside = _span(np.vstack([spectra / scale, drawn, moved]), ratio)

@@ -24,63 +24,62 @@ from mauvecl.schema.errors import InputError
 
 #: Low bits of the integer representation that a bin ignores, which makes bins 2**-13 of the value wide, or less.
 DROPPED_BITS = 10
-#: Distance of the numbers of far bins, below and above, from those of 32-bit integers without the dropped bits.
+#: The number of a far bin is the ordered integer without these bits, less `FAR` below the fine bins, plus `FAR` above.
 FAR = 1 << (32 - DROPPED_BITS)
-#: Number in place of a bin's for infinite values and NaN; all numbers have `NUMBER_BITS`.
-UNDEFINED, NUMBER_BITS = -2 * FAR, 34 - DROPPED_BITS
+#: Number that stands for infinite values and NaN.
+UNDEFINED = -2 * FAR
+#: Bits of all numbers.
+NUMBER_BITS = 34 - DROPPED_BITS
 #: Sums of far values are integer multiples of 2**-UNIT_BITS, the smallest float32, and of its square.
 UNIT_BITS = 149
 #: Number of squares below 2**48 whose sum has no more than 63 bits.
 CHUNK = 2**14
-#: Range of numbers up to which an array counts them; wider ranges are sorted.
+#: Largest range of numbers that are counted in an array; numbers of a wider range are sorted.
 MAX_DENSE = 2**16
 
 
 class RowCounts:
-    """Counts of whole numbers in several rows, merged from time to time.
+    """Counts of whole numbers in several rows.
 
-    Numbers have `bits` bits; keys combine row and number.
+    Numbers have `bits` bits, sign included. A key combines the row and the number.
     """
 
     def __init__(self, bits: int = 32) -> None:
         self._span, self._half = 1 << bits, 1 << (bits - 1)
-        self._keys = np.zeros(0, np.int64)
-        self._counts = np.zeros(0, np.int64)
-        self._waiting: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
-        self._waits = 0
+        # Keys and counts: first those merged so far, whose keys ascend, then later ones.
+        self._parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64))]
+        self._n_unmerged = 0
 
     def __eq__(self, other: object) -> bool:
         """Compare counts, merged or not."""
         if not isinstance(other, RowCounts):
             return NotImplemented
-        ours, theirs = ((counts._span, counts.keys, counts.counts) for counts in (self, other))
-        return equal_content(ours, theirs)
+        return equal_content((self._span, self.totals()), (other._span, other.totals()))
 
     __hash__ = None  # type: ignore[assignment]
 
-    @property
-    def keys(self) -> NDArray[np.int64]:
-        """Keys with counts, ascending."""
-        self._merge()
-        return self._keys
+    def totals(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the keys with counts, ascending, and the count of each."""
+        if len(self._parts) > 1:
+            keys, counts = (np.concatenate(arrays) for arrays in zip(*self._parts, strict=True))
+            keys, place = np.unique(keys, return_inverse=True)
+            total = np.zeros(keys.size, np.int64)
+            np.add.at(total, place, counts)
+            self._parts, self._n_unmerged = [(keys, total)], 0
+        return self._parts[0]
 
-    @property
-    def counts(self) -> NDArray[np.int64]:
-        """Count of each key."""
-        self._merge()
-        return self._counts
+    def rows(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Return the row, number and count of each key."""
+        keys, counts = self.totals()
+        rows, numbers = np.divmod(keys, self._span)
+        return rows, numbers - self._half, counts
 
-    @property
-    def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Row and number of each key."""
-        rows, numbers = np.divmod(self.keys, self._span)
-        return rows, numbers - self._half
-
-    def of(self, row: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def in_row(self, row: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the numbers of a row, ascending, and their counts."""
+        keys, counts = self.totals()
         first = row * self._span
-        places = slice(*np.searchsorted(self.keys, (first, first + self._span)))
-        return self._keys[places] - first - self._half, self._counts[places].copy()
+        places = slice(*np.searchsorted(keys, (first, first + self._span)))
+        return keys[places] - first - self._half, counts[places].copy()
 
     def add(self, rows: NDArray[np.int64] | int, numbers: NDArray[np.int64], counts: NDArray[np.integer]) -> None:
         """Add counts of different numbers."""
@@ -100,26 +99,18 @@ class RowCounts:
 
     def _add(self, keys: NDArray[np.int64], counts: NDArray[np.int64]) -> None:
         if keys.size:
-            self._waiting.append((keys, counts))
-            self._waits += keys.size
-            if self._waits > max(MAX_DENSE, self._keys.size):
-                self._merge()
-
-    def _merge(self) -> None:
-        if not self._waiting:
-            return
-        pairs = (self._keys, self._counts), *self._waiting
-        keys, counts = (np.concatenate(arrays) for arrays in zip(*pairs, strict=True))
-        self._keys, place = np.unique(keys, return_inverse=True)
-        self._counts = np.zeros(self._keys.size, np.int64)
-        np.add.at(self._counts, place, counts)
-        self._waiting, self._waits = [], 0
+            self._parts.append((keys, counts))
+            self._n_unmerged += keys.size
+            if self._n_unmerged > max(MAX_DENSE, self._parts[0][0].size):
+                self.totals()
 
     def pack(self, name: str) -> Arrays:
-        """Return the counts as arrays: differences of keys, in the smallest integer types."""
-        arrays = {f"{name}-steps": np.diff(self.keys), name: self.counts}
-        packed = {key: array.astype(np.min_scalar_type(int(array.max(initial=0)))) for key, array in arrays.items()}
-        return {f"{name}-first": self.keys[:1], **packed}
+        """Return the counts as arrays: the first key, and differences of keys and counts in the smallest types."""
+        keys, counts = self.totals()
+        packed = {f"{name}-first": keys[:1]}
+        for key, array in ((f"{name}-steps", np.diff(keys)), (name, counts)):
+            packed[key] = array.astype(np.min_scalar_type(int(array.max(initial=0))))
+        return packed
 
     def merge(self, name: str, arrays: Arrays) -> None:
         """Add packed counts."""
@@ -222,14 +213,14 @@ class Tally:
     def merge(self, packed: Arrays) -> None:
         """Add a packed shard of other realisations."""
         self.counts.merge("counts", packed)
-        self.sums += np.array([[int(value) for value in row] for row in packed["sums"]], object)
+        self.sums += np.vectorize(int, otypes=[object])(packed["sums"])
         self.n += int(packed["n"])
         for index, tail in self.tails.items():
             tail.merge(packed[f"values-{index}"], packed[f"realisations-{index}"])
 
     def distribution(self, index: int) -> Distribution:
         """Return the distribution of a grid."""
-        grid, (numbers, counts) = self.grids[index], self.counts.of(index)
+        grid, (numbers, counts) = self.grids[index], self.counts.in_row(index)
         defined = numbers != UNDEFINED
         return Distribution(
             float(grid["centre"]), 1.0 / float(grid["steps_per_unit"]), numbers[defined], counts[defined],
@@ -333,7 +324,7 @@ class Distribution:
         more = np.flatnonzero(np.cumsum(counts[::-1])[::-1] > n_above)
         return float(upper[more[-1]]) if more.size else -math.inf
 
-    def around(self, edge: float) -> tuple[int, int]:
+    def counts_around(self, edge: float) -> tuple[int, int]:
         """Return the counts at or above the lower edge of a bin, and in the filled bin below that edge."""
         _, upper, counts = self.bins
         at = int(np.searchsorted(upper, edge, side="right"))

@@ -1,6 +1,6 @@
 """Detections: thresholds with a known false-alarm probability, detection probabilities and ROC curves.
 
-Departures of the simulated false-alarm probabilities from the closed forms for Gaussian noise are given with causes.
+Departures say by how much simulated false-alarm probabilities differ from closed forms for Gaussian noise, and why.
 """
 
 from __future__ import annotations
@@ -210,8 +210,8 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         numbers_above = (int(np.floor(fap * null.n * (1 + 1e-12))), n_high, max(n_low - 1, 0))
         # The lowest edges of the null's bins with few enough counts above.
         cut = Interval(*map(null.edge_with_at_most, numbers_above))
-        beyond, at = null.around(cut.value)
-        check_atom(f"{statistic} of {self.quiet.name}", fap, beyond / null.n, at / null.n)
+        n_above, n_at = null.counts_around(cut.value)
+        check_atom(f"{statistic} of {self.quiet.name}", fap, n_above / null.n, n_at / null.n)
         return cut
 
     def tail(self, fap: float, statistic: str = "chi2", *, template: int = 0) -> Tail | None:
@@ -431,12 +431,13 @@ def departures(detection: Detection, fap: float) -> list[Departure]:
         added = statistic.added_variance(setting)
         for template in range(len(detection.flares) if statistic.shaped else 1):
             null, flare = detection.closed_form(name, template=template), detection.shape(name, template)
-            threshold, rounding, with_ends = null.isf(fap), 0.0, 0.0
+            threshold, changes = null.isf(fap), list[float]()
             for shift, variance in digital:
                 mean = np.where(scene.used, (1.0 - (added > 0)) * shift, 0.0)
                 recorded = Differences(mean, (1.0 + added) * variance)
                 form = statistic.integrate_drawn(setting, detection.quiet, recorded, flare)
-                rounding, with_ends = with_ends, form.sf(threshold) / fap - 1.0
+                changes.append(form.sf(threshold) / fap - 1.0)
+            rounding, with_ends = changes or (0.0, 0.0)
             simulated = detection.false_alarm_probability(threshold, name, template=template)
             skew = _skewed_fap(detection, statistic, flare, null, threshold) / fap - 1.0
             effects = skew, rounding, with_ends - rounding, tuple(unpredicted)

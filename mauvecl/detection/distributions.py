@@ -74,7 +74,7 @@ def central_counts(trials: int, probability: float) -> tuple[int, int]:
 
 
 #: Number of detections or misses below which Clopper and Pearson's interval replaces Jeffreys's.
-FEW = 10
+MIN_JEFFREYS = 10
 #: Gauss-Legendre rule of the integral over correlations.
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(64)
 
@@ -99,7 +99,7 @@ def detection_interval(above: Sequence[float], trials: int, fap: float, correlat
     middle, lower, upper = special.ndtri([(k + 0.5) / (trials + 1.0) for k in above]).tolist()
     above_cut, missed, tail = above[0], trials - above[0], (1.0 - CONFIDENCE) / 2.0
     # For small counts Jeffreys's interval undercovers; Clopper and Pearson's never does.
-    half = 0.5 if min(above_cut, missed) >= FEW else 0.0
+    half = 0.5 if min(above_cut, missed) >= MIN_JEFFREYS else 0.0
     low = float(special.ndtri(special.betaincinv(above_cut + half, missed + 1.0 - half, tail)))
     high = float(special.ndtri(special.betaincinv(above_cut + 1.0 - half, missed + half, 1.0 - tail)))
     # Correlation of the crossings of the threshold without and with a flare.
@@ -211,7 +211,7 @@ class _Tails:
     """Tails of several quadratic forms, by a contour integral of each.
 
     Weights, which are in units of the largest of a form, are distinct, and have a number of squares and the sum of
-    their shifts^2; the shape of each array is (n_form, n_weight). Padding has a weight of zero.
+    their shifts^2, the noncentrality; the shape of each array is (n_form, n_weight). Padding has a weight of zero.
     """
 
     def __init__(self, forms: Sequence[QuadraticForm]) -> None:
@@ -224,7 +224,7 @@ class _Tails:
         padded = np.zeros((3, len(distinct), size))
         for row, arrays in enumerate(distinct):
             padded[:, row, : arrays[0].size] = arrays
-        self.weight, self.count, self.push = padded
+        self.weight, self.count, self.noncentrality = padded
 
     def above(self, value: float) -> Float:
         """Return the probabilities of exceeding a value, shape (n_form,)."""
@@ -287,18 +287,20 @@ class _Tails:
 
     def _exponent(self, gap: NDArray[Any], x: Float, upper: NDArray[np.bool_]) -> NDArray[np.complex128]:
         """Return K(s) - s x - log(+-s), shape of the gap."""
-        factors, s, count, push = self._factors(gap), 0.5 - gap, self.count[..., None], self.push[..., None]
+        factors, s = self._factors(gap), 0.5 - gap
+        count, noncentrality = self.count[..., None], self.noncentrality[..., None]
         # Real logarithms and angles are several times faster than complex ones.
         square = factors.real**2 + factors.imag**2
         log = 0.5 * (np.log(square) @ count) + 1j * (np.arctan2(factors.imag, factors.real) @ count)
-        turn = (factors.real / square) @ push - push.sum(axis=1, keepdims=True) - 1j * ((factors.imag / square) @ push)
+        real, imaginary = ((part / square) @ noncentrality for part in (factors.real, factors.imag))
+        shifted = real - noncentrality.sum(axis=1, keepdims=True) - 1j * imaginary
         sign = np.where(upper, 1.0, -1.0)[:, None]
-        return np.asarray((0.5 * (turn - log))[..., 0] - s * x[:, None] - np.log(sign * s))
+        return np.asarray((0.5 * (shifted - log))[..., 0] - s * x[:, None] - np.log(sign * s))
 
     def _derivative(self, gap: Float, order: int) -> Float:
         """Return a derivative of K of order 1 to 3, shape (n_form,)."""
         factors = self._factors(gap[:, None])[:, 0]
-        terms = (self.weight / factors) ** order * (self.count + order * self.push / factors)
+        terms = (self.weight / factors) ** order * (self.count + order * self.noncentrality / factors)
         return np.asarray((0.0, 1.0, 2.0, 8.0)[order] * terms.sum(axis=1))
 
     def _saddles(self, x: Float, upper: NDArray[np.bool_]) -> Float:
@@ -361,6 +363,7 @@ class Mixture:
 
     def sf(self, value: float) -> float:
         mean, std, _ = self._moments
+        # This holds for normal parts; the tails of quadratic forms replace theirs.
         above = special.ndtr((mean - value) / std)
         for places, tails in self._tails:
             above[places] = tails.above(value)

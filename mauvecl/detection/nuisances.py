@@ -70,7 +70,8 @@ class Nuisances(ContentEquality):
         """Compute the nuisance spectra of a quiescent exposure.
 
         `sd` holds prior standard deviations by name, of `NUISANCES` or `own`, infinite to project a parameter out;
-        `own` holds user-defined spectra, DN of the exposure for unit amplitude, shape (n_pixel,).
+        `own` holds user-defined spectra, DN of the exposure for unit amplitude, shape (n_pixel,). Raises InputError for
+        a spectrum that has another shape, or is zero in all pixels.
         """
         own, shape = own or {}, quiet.wavelength_nm.shape
         spectra, of_flare = (np.zeros((len(sd), *shape)) for _ in range(2))

@@ -153,6 +153,7 @@ class Hypotheses:
         return self.statistic(statistic).dof(self.setting)
 
     def _check(self, statistic: str, flare: int | None, template: int = 0) -> None:
+        """Raise InputError unless the statistic was requested and the flare, or the template that it needs, exists."""
         if self.statistic(statistic).shaped and flare is None:
             flare = template
         if flare is not None and not 0 <= flare < len(self.flares):
@@ -220,7 +221,7 @@ class ChannelPlan:
         return len(FIXED_STATISTICS) * len(self.linear_end) + len(self.weights) + len(self.scales)
 
 
-#: Rows of weights by statistic, scenario and template, ordered by scenario.
+#: Rows of weights by statistic, scenario, and template (of chi-squared, the number of the row), ordered by scenario.
 Rows = dict[tuple[str, int, int], Float]
 
 

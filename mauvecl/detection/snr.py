@@ -1,4 +1,4 @@
-"""Distributions of signal-to-noise ratios, and exact sums over shards."""
+"""Distributions of the S/N of pixels and resolution elements, and results of requests from the sums of their shards."""
 
 from __future__ import annotations
 
@@ -140,14 +140,14 @@ class Counts:
 
     def dense(self, kind: str) -> NDArray[np.int64]:
         """Return the histograms in the device's columns, without values beyond, shape (n, OBSERVER_BINS)."""
-        dense = np.zeros(self.shapes[kind], np.int64)
-        (rows, bins), inner = self.bins[kind].places, self.within(kind)
-        dense[rows[inner], bins[inner] - FIRST_BIN + 1] = self.bins[kind].counts[inner]
+        dense, inner = np.zeros(self.shapes[kind], np.int64), self.within(kind)
+        rows, bins, counts = (values[inner] for values in self.bins[kind].rows())
+        dense[rows, bins - FIRST_BIN + 1] = counts
         return dense
 
     def within(self, kind: str) -> NDArray[np.bool_]:
         """Return the mask of the filled bins that are among the device's."""
-        _, bins = self.bins[kind].places
+        _, bins, _ = self.bins[kind].rows()
         return (bins >= FIRST_BIN) & (bins <= LAST_BIN)
 
     def pack(self) -> Arrays:
@@ -228,7 +228,7 @@ class SnrResult(Drawable, ContentEquality):
         """Return the table of pixels or elements; `snr` converts fractional bin numbers to ratios."""
         rows = []
         for row in range(len(expected)):
-            filled, counts = self.counts.bins[kind].of(row)
+            filled, counts = self.counts.bins[kind].in_row(row)
             middle = snr(row, filled + 0.5)
             mean = counts @ middle / self.counts.n
             edges = np.column_stack([snr(row, filled), snr(row, filled + 1)]).ravel()

@@ -181,11 +181,12 @@ def tail(hypotheses: Hypotheses, fap: float, statistic: str, *, template: int = 
         values, logs = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
         weight, n = np.exp(logs), values.size
         cut, error = _threshold(values, weight, fap)
-        # Probabilities of values above the threshold, and a lower limit of that of the threshold itself.
-        same = weight[values == cut.value]
-        at = float(same.sum() / n)
-        least = at - 4.0 * math.sqrt(max(float(same @ same) / n - at**2, 0.0) / n)
-        check_atom(f"{statistic} of {hypotheses.quiet.name}", fap, float(weight[values > cut.value].sum() / n), least)
+        above = float(weight[values > cut.value].sum() / n)
+        # The threshold's own probability is estimated from few draws, so it is an atom only if its lower limit is.
+        own = weight[values == cut.value]
+        chance = float(own.sum() / n)
+        lower_limit = chance - 4.0 * math.sqrt(max(float(own @ own) / n - chance**2, 0.0) / n)
+        check_atom(f"{statistic} of {hypotheses.quiet.name}", fap, above, lower_limit)
         if error <= WANTED_ERROR:
             return Tail(cut, fap, error, values.size)
         if goal >= MAX_REALISATIONS:

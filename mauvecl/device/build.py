@@ -204,7 +204,10 @@ def devices() -> list[DeviceRecord]:
 
 
 def choose_device(name: str | None) -> tuple[Any, DeviceRecord]:
-    """Return the device whose number, platform or name matches `name`, by default the first one, and its record."""
+    """Return the device whose number, platform or name matches `name`, by default the first one, and its record.
+
+    Raises DeviceError if none matches.
+    """
     pairs = _handles_and_records()
     for index, (handle, record) in enumerate(pairs):
         if name is None or name == str(index) or name.casefold() in record.label.casefold():
@@ -233,8 +236,8 @@ def render(kernel_files: tuple[str, ...], variant: Variant) -> str:
     plain = "streams reference prior_bits prior_finest prior_nodes observer_bins ln2_parts bins fine_bits"
     values |= {name: getattr(layout, name.upper()) for name in plain.split()}
     names = (*SHARED_FILES, *kernel_files)
-    folder = files("mauvecl.kernels")
-    texts = [folder.joinpath(f"{name}.cl.mako").read_text(encoding="utf-8") for name in names]
+    folder = files("mauvecl") / "kernels"
+    texts = [(folder / f"{name}.cl.mako").read_text(encoding="utf-8") for name in names]
     structs = layout.c_structs()
 
     key = hashlib.sha256(repr((structs, values, texts)).encode()).hexdigest()[:32]
@@ -262,7 +265,10 @@ def out_of_memory(error: Exception) -> bool:
 
 
 def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
-    """Compile a rendered source with strict arithmetic, or load it from the cache."""
+    """Compile a rendered source with strict arithmetic, or load it from the cache.
+
+    Raises DeviceError if the driver cannot compile it; the message then contains the numbered lines of the source.
+    """
     cl = load_opencl()
     device = context.devices[0]
     # Without -w, PoCL's compiler prints the number of suppressed warnings.

@@ -303,6 +303,7 @@ def _bytes(memory: int, address: int, size: int) -> bytes:
 
 
 def _text_at(memory: int, address: int) -> str:
+    """Return the text that begins at an address, empty if it does not end within 64 bytes."""
     text, end, _ = _bytes(memory, address, 64).partition(b"\0")
     return text.decode("ascii", errors="replace") if end else ""
 
@@ -492,6 +493,7 @@ def _try(name: str | None, number: int, device: Any, limit_s: float) -> str | No
 
 
 def _last_line(file: IO[bytes]) -> str:
+    """Return the last line of a file that is not blank, or an empty string."""
     file.seek(0)
     lines = file.read(2**16).decode(errors="replace").split("\n")
     return next((line.strip()[:200] for line in reversed(lines) if line.strip()), "")

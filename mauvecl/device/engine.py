@@ -202,6 +202,7 @@ class Engine:
         return SnrResult(request.expectation, request.scene, counts)
 
     def _snr(self, request: requests.SnrRequest, shard: requests.Shard) -> Counts:
+        """Count the S/N of pixels and elements in a shard."""
         x, scene, counts = request.expectation, request.scene, snr.counts_of(request)
         with scene_launches(self.open_device, scene, request.seed, chunk=ELEMENT_CHUNK) as launches:
             launches.observe(snr.observers(x, scene), snr.elements(x))
@@ -279,6 +280,7 @@ class Engine:
     def _detection(
         self, request: requests.DetectRequest, shard: requests.Shard, *, before: int = 0, total: int | None = None
     ) -> Tally:
+        """Count the statistics of a shard; `before` and `total` as for `Tiles.for_each`."""
         plan = request.plans[shard.part]
         tally = plan.tally()
         with detection_launches(self.open_device, plan, request.seed) as launches:

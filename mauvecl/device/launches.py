@@ -69,16 +69,14 @@ class Tiles:
         self._device, self._progress, self._largest, self._step = device, progress, largest, device.step
 
     def for_each(
-        self,
-        start: int,
-        count: int,
-        bytes_each: int,
-        work: Callable[[Tile, int], None],
-        *,
-        before: int = 0,
-        total: int | None = None,
-    ) -> None:
-        """Call `work(tile, done)` for each tile, with smaller tiles if the device's memory does not suffice."""
+        self, start: int, count: int, bytes_each: int, work: Callable[[Tile, int], None], *,
+        before: int = 0, total: int | None = None,
+    ) -> None:  # fmt: skip
+        """Call `work(tile, done)` for each tile, with smaller tiles if the device's memory does not suffice.
+
+        A realisation needs `bytes_each` on the device. `before` and `total` report the progress of several ranges: the
+        realisations of earlier ones, and of all.
+        """
         memory = min(TILE_BYTES, self._device.record.global_memory // 8)
         fit = memory // bytes_each if bytes_each else LARGEST_TILE
         fit = min(self._largest or LARGEST_TILE, LARGEST_TILE, max(fit, 1))
@@ -346,15 +344,9 @@ ELEMENT_CHUNK = 8
 
 
 def scene_launches(
-    device: Device,
-    scene: Scene,
-    seed: int,
-    *,
-    linears: int = 0,
-    smooths: int = 0,
-    chunk: int | None = None,
+    device: Device, scene: Scene, seed: int, *, linears: int = 0, smooths: int = 0, chunk: int | None = None,
     **options: Any,
-) -> Launches:
+) -> Launches:  # fmt: skip
     """Return the launches of a scene, with the smallest kernel variant that suits it and has these options."""
     of_scene = ("frames", "clip", "joint", "quartic", "photons", "additive", "modulations")
     variant = replace(

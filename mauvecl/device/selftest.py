@@ -54,16 +54,9 @@ CHECK_COLUMNS = (
 
 
 def toy(
-    pixels: int = 64,
-    frames: int = 10,
-    *,
-    flare: float = 0.0,
-    dark: float = 2225.0,
-    read: float = 12.0,
-    light: float = 40.0,
-    unit: Any = "DN",
-    photon_noise: Any = "gaussian",
-) -> Expectation:
+    pixels: int = 64, frames: int = 10, *, flare: float = 0.0, dark: float = 2225.0, read: float = 12.0,
+    light: float = 40.0, unit: Any = "DN", photon_noise: Any = "gaussian",
+) -> Expectation:  # fmt: skip
     """Return a small exposure of a smooth spectrum on a uniform detector; dark in DN, light in electrons per frame."""
     shape = light * (1.0 + 0.5 * np.sin(np.arange(pixels) / 9.0))
     uniform = np.ones(pixels)
@@ -303,7 +296,7 @@ def results(engine: Engine, name: str, count: int) -> dict[str, NDArray[Any]]:
 
 def histograms_of(counts: Counts) -> NDArray[np.int64]:
     """Return all counts of histograms as one array."""
-    far = [array[~counts.within(k)] for k, bins in counts.bins.items() for array in (bins.keys, bins.counts)]
+    far = [array[~counts.within(k)] for k, bins in counts.bins.items() for array in bins.totals()]
     return np.concatenate([np.ravel(array) for array in (*map(counts.dense, counts.bins), counts.clipped, *far)])
 
 

@@ -136,23 +136,23 @@ class Stares:
         values_per_stare = len(request.flares.amplitudes) * shape[0] * shape[1]
         # Pieces are small enough for a processor's cache; the cumulants need no full vector of long stares.
         step = 1 if request.method == "cumulants" else self.open_device.width
-        piece = max(step, REDUCED_BYTES // (4 * values_per_stare) // step * step)
-        buffer = np.empty(values_per_stare * piece, np.float32)
-        glow = np.empty((1, piece, shape[0] + 1, shape[1]) if request.glow else 0, np.float32)
+        piece_size = max(step, REDUCED_BYTES // (4 * values_per_stare) // step * step)
+        buffer = np.empty(values_per_stare * piece_size, np.float32)
+        glow = np.empty((1, piece_size, shape[0] + 1, shape[1]) if request.glow else 0, np.float32)
         with StareLaunches(self.open_device, request) as launches:
 
             def work(tile: Tile, done: int) -> None:
                 reduced = []
-                for few in tile.pieces(piece):
-                    out = buffer[: values_per_stare * few.count].reshape(-1, few.count, *shape)
-                    flares = request.flares.part(few.begin - request.start, few.count)
-                    launches.upload_flares(flares, few.begin, few.count)
-                    launches.draw(few, out)
+                for piece in tile.pieces(piece_size):
+                    out = buffer[: values_per_stare * piece.count].reshape(-1, piece.count, *shape)
+                    flares = request.flares.part(piece.begin - request.start, piece.count)
+                    launches.upload_flares(flares, piece.begin, piece.count)
+                    launches.draw(piece, out)
                     draws = [np.moveaxis(out[..., :n_frames], 2, 3)[scenarios]]
                     if request.glow:
-                        launches.glow(few, glow)
-                        draws.append(np.moveaxis(glow[0, : few.count, :, :n_frames], 1, 2))
-                    reduced.append(dict(request.reducing(draws[0], few.begin, *draws[1:])))
+                        launches.glow(piece, glow)
+                        draws.append(np.moveaxis(glow[0, : piece.count, :, :n_frames], 1, 2))
+                    reduced.append(dict(request.reducing(draws[0], piece.begin, *draws[1:])))
                 # Results are added last, since a tile that fails is drawn again.
                 parts.extend(reduced)
 
@@ -195,16 +195,16 @@ class StareLaunches(Launches):
         super().__init__(device, scene, variant, request.seed)
         self._seed = request.seed
         self._stare, self._local = stare, (1, 1) if variant.width > 1 else None
-        self._known = [*map(self.upload, (stare.numbers, stare.known, stare.curves, stare.kinds))]
+        self._stare_buffers = [*map(self.upload, (stare.numbers, stare.known, stare.curves, stare.kinds))]
         if table is None:
             by_pixels = (with_padding(stare.mixtures), stare.spectra, stare.weights, stare.constants)
             # Only the range of pixels that a sum weights is drawn.
             chunks = np.flatnonzero(stare.weights.reshape(len(stare.weights), -1, variant.chunk).any(axis=(0, 2)))
             first, last = (chunks[0], chunks[-1] + 1) if chunks.size else (0, 0)
             ends = np.uint32(first * variant.chunk), np.uint32(last * variant.chunk)
-            self._of_method = [*map(self.upload, by_pixels), *ends]
+            self._method_arguments = [*map(self.upload, by_pixels), *ends]
         else:
-            self._of_method = [self.upload(np.concatenate([table.rows.ravel(), table.lower]))]
+            self._method_arguments = [self.upload(np.concatenate([table.rows.ravel(), table.lower]))]
 
     def upload_flares(self, flares: stare_scene.Flares, first: int, count: int) -> None:
         """Upload the flares and the pointing losses of the next `count` stares."""
@@ -213,7 +213,7 @@ class StareLaunches(Launches):
             losses = self._stare.losses(np.arange(count, dtype=np.uint64) + np.uint64(first), self._seed)
         self._flares = [
             self._fill("stare_job", self._stare.stare_struct(flares)),
-            *self._known,
+            *self._stare_buffers,
             self._fill("flares", flares.rows),
             self._fill("amplitudes", flares.amplitudes),
             self._fill("losses", losses),
@@ -229,7 +229,7 @@ class StareLaunches(Launches):
     def draw(self, tile: Tile, out: Floats) -> None:
         """Draw the statistics of a tile's frames into `out`, shape (n_scenario, n_stare, n_statistic, n_padded)."""
         if self._by_sums:
-            self._in_frames("stare_sums", self.variant, self._of_method, tile, out)
+            self._in_frames("stare_sums", self.variant, self._method_arguments, tile, out)
             return
         # Pixels are drawn a few frames of all stares at a time.
         tile = replace(tile, width=self.variant.width)
@@ -243,7 +243,7 @@ class StareLaunches(Launches):
             size = min(block, n_frames - begin)
             items = (tile.size // self.variant.width, size)
             values = self._scratch("values", 4 * values_per_frame * size)
-            arguments = (np.uint32(begin), *self._of_method, np.uint32(tile.size), values)
+            arguments = (np.uint32(begin), *self._method_arguments, np.uint32(tile.size), values)
             kernel(self._queue, items, self._local, *common, *arguments)
             host = np.empty((size, self._scenarios, self.variant.sums, tile.size), np.float32)
             self._cl.enqueue_copy(self._queue, host, values)

@@ -9,7 +9,7 @@ realistic number of draws reveals the difference.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
 from itertools import product
 from typing import TYPE_CHECKING, Literal, Self, TypedDict
@@ -310,7 +310,6 @@ class DrawMethod:
     photons: bool
     frames_per_draw: int
     cumulants: list[Cumulants]  # of one draw of each scenario
-    tables: list[layout.AliasTable] = field(default_factory=list)  # of the scene, filled as its arrays are
 
 
 def choose_method(scenarios: Sequence[Expectation], drawing: Drawing) -> DrawMethod:
@@ -384,9 +383,11 @@ def _draw_frames(
     scenarios: Sequence[Expectation], drawing: Drawing, factors: Factors, corners: Sequence[tuple[float, float, float]]
 ) -> bool:
     """Return whether frames are drawn one by one; raises InputError if they would have to be, but must be stacked."""
-    if scenarios[0].n_frames == 1 or drawing.mode == "frames":
-        # For a single frame, both modes give the same draws.
-        return drawing.mode == "frames" and scenarios[0].n_frames > 1
+    if scenarios[0].n_frames == 1:
+        # Both modes give the same draws.
+        return False
+    if drawing.mode == "frames":
+        return True
     for x in scenarios:
         near = near_rail(x, factors, drawing.processes)
         # The approximation of rounding as noise is worst for the least light and dark.

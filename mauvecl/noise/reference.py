@@ -250,6 +250,7 @@ def analogue(
 def _responding(
     r: NDArray[np.void], c0: Floats, z: Floats, light_change: Floats, dark_change: Floats, fma: Fma, *, quartic: bool
 ) -> Floats:
+    """Return a joint draw from normals z that responds to factors on light and dark, as `polynomial` without them."""
     unity = np.float32(1.0)
     light, dark = light_change + unity, dark_change + unity
     variance = fma(light, r["light_variance"], fma(dark, r["dark_variance"], r["other_variance"]))

@@ -31,7 +31,7 @@ WEIGHTS = np.exp(-(SCORE**2) / 2) / np.exp(-(SCORE**2) / 2).sum()
 #: Sums of squares use every tenth node, since they are wide; weighted sums may be much narrower than a prior.
 COARSE = 10
 #: Nodes of the Gauss-Hermite rule for factors after the first.
-FEW = 7
+HERMITE_NODES = 7
 #: A factor is treated as a normal amplitude of a known spectrum if one standard deviation changes no pixel's variance
 #: by more than this fraction (for weighted sums, and for sums of squares), and its values deviate from a linear
 #: function of the score by less than `STRAIGHT` standard deviations, root mean square.
@@ -110,28 +110,29 @@ def drawn_factors(processes: Processes, quiet: Expectation) -> dict[SignalPart, 
 def factor_nodes(factors: Mapping[SignalPart, FactorDistribution], x: Expectation, *, weighted: bool) -> Nodes:
     """Return the nodes over which a statistic of an exposure, a weighted sum or a sum of squares, is integrated."""
     light, sky, dark = zip(*changes_of(x), strict=True)
-    moved: dict[SignalPart, tuple[Float, Float]] = {"dark": dark, "light": light, "sky": sky}
-    grids, rows = [], []
-    step, few = 1 if weighted else COARSE, np.polynomial.hermite_e.hermegauss(FEW)
+    changes: dict[SignalPart, tuple[Float, Float]] = {"dark": dark, "light": light, "sky": sky}
+    # Nodes of each factor: weight, value of the factor, and normal score.
+    grids, spectra = list[list[tuple[float, float, float]]](), list[Float]()
+    step, (hermite, hermite_weight) = 1 if weighted else COARSE, np.polynomial.hermite_e.hermegauss(HERMITE_NODES)
     score, weight = SCORE[::step], WEIGHTS[::step] / WEIGHTS[::step].sum()
-    for name, (part, variance) in moved.items():
-        spread = factors.get(name)
-        if spread is None:
+    for part, (mean_change, variance_change) in changes.items():
+        factor = factors.get(part)
+        if factor is None:
             grids.append([(1.0, 1.0, 0.0)])
-            continue
-        if spread.normal and (spread.sd * variance <= VARIANCE_FRACTION[weighted] * x.variance_dn2).all():
-            if spread.sd:
-                rows.append(spread.sd * part)
-            grids.append([(1.0, spread.mean, 0.0)])
-            continue
-        values = np.interp(score, SCORE, spread.values)
-        grids.append(list(zip(weight.tolist(), values.tolist(), score.tolist(), strict=True)))
-        score, weight = few[0], few[1] / few[1].sum()
+        elif factor.normal and (factor.sd * variance_change <= VARIANCE_FRACTION[weighted] * x.variance_dn2).all():
+            grids.append([(1.0, factor.mean, 0.0)])
+            if factor.sd:
+                spectra.append(factor.sd * mean_change)
+        else:
+            values = np.interp(score, SCORE, factor.values)
+            grids.append(list(zip(weight.tolist(), values.tolist(), score.tolist(), strict=True)))
+            # Further factors have fewer nodes.
+            score, weight = hermite, hermite_weight / hermite_weight.sum()
     # Each of shape (n_factor, n).
     weights, (dark, light, sky), scores = np.ascontiguousarray(np.array([*product(*grids)]).T)
     amounts = np.column_stack([light - 1.0, light * (sky - 1.0), dark - 1.0])
-    spectra = np.array(rows).reshape(len(rows), x.variance_dn2.size)
-    return Nodes(math.prod(weights), amounts, dict(zip(moved, scores, strict=True)), spectra)
+    of_normal = np.array(spectra).reshape(len(spectra), x.variance_dn2.size)
+    return Nodes(math.prod(weights), amounts, dict(zip(changes, scores, strict=True)), of_normal)
 
 
 def quantile_at_score(table: NDArray[np.float32], score: Float) -> Float:
@@ -153,7 +154,10 @@ def padded(n_pixel: int) -> int:
 
 
 def fill_poisson_counts(out: NDArray[np.void], mean: Float, gain: Float, tables: list[AliasTable]) -> Float:
-    """Fill `out` for draws of Poisson counts; return the integers to which counts are relative, shape (n_pixel,)."""
+    """Fill `out` for draws of Poisson counts, and append their alias tables to `tables`.
+
+    Return the integers to which counts are relative, shape (n_pixel,).
+    """
     centre = np.rint(mean)
     # A pair of pixels shares two words. A table uses one and the expansion both, so a pair must use the same method.
     expanded = _both_of_a_pair(mean >= SMALLEST_EXPANDED)
@@ -233,7 +237,6 @@ class Scene:
     joint: bool  # whether all noise of a draw comes from one normal, instead of separate Poisson counts
     quartic: bool  # whether a joint draw needs the fourth power of its normal and, if factors vary, fifth cumulants
     photons: bool  # whether photon counts are also drawn separately
-    clip: bool  # whether single draws are clipped at the ADC's rails
     processes: Processes  # optional processes that are drawn
     job: NDArray[np.void]  # shape (); parameters of a launch without the seed
     pixels: NDArray[np.void]  # shape (n_padded,)
@@ -257,6 +260,11 @@ class Scene:
     def n_draws(self) -> int:
         """Number of draws that are summed in a realisation of a pixel."""
         return self.n_frames if self.frames else 1
+
+    @property
+    def clip(self) -> bool:
+        """Whether draws are single frames, which are clipped at the ADC's rails."""
+        return self.n_draws == self.n_frames
 
     @property
     def additive(self) -> tuple[str, ...]:
@@ -299,15 +307,16 @@ def prepare(
     """Compute the arrays of scenarios for the device, from expectations that differ only in their light.
 
     Options of the draw can also be given as keywords. All scenarios are compared with the first, the quiescent star;
-    `first_group` is the number of the first group of four pixels in the generator's counter.
+    `first_group` is the number of the first group of four pixels in the generator's counter. Raises InputError if the
+    scenarios cannot be drawn as requested, or not together.
     """
     drawing, quiet = drawing or Drawing(**options), scenarios[0]
-    method, used = choose_method(scenarios, drawing), ~quiet.saturated
+    method, used, tables = choose_method(scenarios, drawing), ~quiet.saturated, list[AliasTable]()
     dark_dn, step, darks = np.zeros(used.size), quiet.dark_step_dn, np.zeros(padded(used.size), layout.POISSON)
     if not method.joint:
         # Separate dark counts are relative to integers.
         mean = method.frames_per_draw * quiet.dark_dn / step
-        dark_dn = step * fill_poisson_counts(darks[: used.size], mean, step, method.tables)
+        dark_dn = step * fill_poisson_counts(darks[: used.size], mean, step, tables)
     pixels = np.zeros(darks.size, layout.PIXEL)
     pixels["used"][: used.size], pixels["electron_gain"][: used.size] = used, quiet.gain_dn_per_electron
     pixels["element_end"][: used.size] = np.append(np.diff(quiet.element) > 0, True)
@@ -316,15 +325,15 @@ def prepare(
     pixels["four_uneven"] = np.repeat(uneven.reshape(-1, 4).any(axis=1), 4)
     arrays = _padding(scenarios, method, comparison, modulated=bool(drawing.processes.modulations))
     for k, x in enumerate(scenarios):
-        _fill_draw(arrays, k, x, method, dark_dn)
+        _fill_draw(arrays, k, x, method, dark_dn, tables)
     _fill_comparison(arrays, quiet, quiet.n_frames // method.frames_per_draw, comparison, used)
-    job = _job(scenarios, drawing, method, comparison, first_group)
-    tables = np.concatenate([np.zeros(0, np.uint32), *(t.entries for t in method.tables)]).astype(np.uint32)
+    job = _job(scenarios, drawing, method, comparison, first_group, tables)
+    entries = np.concatenate([np.zeros(0, np.uint32), *(table.entries for table in tables)])
     return Scene(
         used.size, quiet.n_frames, method.frames, method.joint, method.quartic, method.photons,
-        clip=method.frames_per_draw == 1, processes=drawing.processes, job=job, pixels=pixels, dark_counts=darks,
-        tables=tables, priors=method.factors.tables, medians=tuple(method.factors.medians.values()),
-        comparison=comparison, used=used, **arrays,
+        processes=drawing.processes, job=job, pixels=pixels, dark_counts=darks, tables=entries,
+        priors=method.factors.tables, medians=tuple(method.factors.medians.values()), comparison=comparison,
+        used=used, **arrays,
     )  # fmt: skip
 
 
@@ -352,8 +361,10 @@ def _padding(
     return arrays
 
 
-def _fill_draw(arrays: PerScenario, k: int, x: Expectation, method: DrawMethod, dark_dn: Float) -> None:
-    """Fill the arrays for the draw of scenario k, whose dark counts are relative to `dark_dn`."""
+def _fill_draw(
+    arrays: PerScenario, k: int, x: Expectation, method: DrawMethod, dark_dn: Float, tables: list[AliasTable]
+) -> None:
+    """Fill the arrays for the draw of scenario k, whose dark counts are relative to `dark_dn`; append its `tables`."""
     c, factors, n_pixel, gain = method.cumulants[k], method.factors, dark_dn.size, x.gain_dn_per_electron
     level = arrays["levels"][k, :n_pixel]
     # The mean to which a draw is relative; separate Poisson counts are relative to integers.
@@ -368,7 +379,7 @@ def _fill_draw(arrays: PerScenario, k: int, x: Expectation, method: DrawMethod, 
     else:
         photons = c.photons
         if method.photons:
-            photons = fill_poisson_counts(arrays["photon_counts"][k, :n_pixel], c.photons, gain, method.tables)
+            photons = fill_poisson_counts(arrays["photon_counts"][k, :n_pixel], c.photons, gain, tables)
         mean = method.frames_per_draw * x.bias_dn + dark_dn + gain * photons
         level["c1"] = np.sqrt(c.gaussian)
     base = arrays["base_dn"][k] = np.clip(np.rint(mean), 0, x.highest_dn if method.frames_per_draw == 1 else np.inf)
@@ -408,9 +419,10 @@ def _fill_comparison(
 
 
 def _job(
-    scenarios: Sequence[Expectation], drawing: Drawing, method: DrawMethod, comparison: Comparison, first_group: int
-) -> NDArray[np.void]:
-    """Return the parameters of a launch, layout.JOB, shape (); append the tables of additive processes to `method`."""
+    scenarios: Sequence[Expectation], drawing: Drawing, method: DrawMethod, comparison: Comparison, first_group: int,
+    tables: list[AliasTable],
+) -> NDArray[np.void]:  # fmt: skip
+    """Return the parameters of a launch, layout.JOB, shape (); append the `tables` of additive processes."""
     quiet, job = scenarios[0], np.zeros((), layout.JOB)
     n_pixel = quiet.wavelength_nm.size
     job["pixel_count"], job["padded_count"] = n_pixel, padded(n_pixel)
@@ -421,7 +433,7 @@ def _job(
     job["pair_scale"] = (1.0 + comparison.added_variance) / 2.0
     for name, process in drawing.processes.additive.items():
         table = alias_table_of(process.charge(method.frames_per_draw * quiet.frame_s))
-        job[f"{name}_table"] = sum(t.entries.size for t in method.tables)
+        job[f"{name}_table"] = sum(earlier.entries.size for earlier in tables)
         job[f"{name}_bits"], job[f"{name}_low"] = table.bits, table.low
-        method.tables.append(table)
+        tables.append(table)
     return job

@@ -125,6 +125,7 @@ Row = TypeVar("Row", bound=Unknown)
 
 
 def _dark_follows(at: Conditions, temperature_c: Float) -> Float:
+    """Return the relative change of the dark current at other temperatures than the expectation's."""
     import numpy as np
 
     return np.asarray(np.expm1(at["dark_slope_per_c"] * (temperature_c - at["temperature_c"])))
@@ -136,6 +137,7 @@ def _lost(key: str) -> Callable[[Conditions, Float], Float]:
 
 
 def _tilt(quiet: Expectation) -> Float:
+    """Return the relative change of each pixel's light for unit tilt, from -1 to 1 over the output range."""
     return (quiet.wavelength_nm - MIDDLE_NM) / TILT_NM
 
 

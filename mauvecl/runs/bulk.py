@@ -340,7 +340,7 @@ def _faults_of_description(store: Store, repair: bool) -> Iterator[Fault]:
                 stated = json.loads(data)
                 former = (key for key, words in FORMER.items() if stated.get("attributes", {}).get(key) == words)
                 names = (*ignored, *former)
-                existing, expected = (without(one, names) for one in (stated, json.loads(content)))
+                existing, expected = (without(description, names) for description in (stated, json.loads(content)))
                 fault = "good" if existing in (expected, without(expected, LATER_ATTRIBUTES)) else "foreign"
             elif data == content:
                 fault = "good"

@@ -172,16 +172,9 @@ class Checkpoint:
     """
 
     def __init__(
-        self,
-        folder: Path,
-        verb: str,
-        study: Any,
-        *,
-        resume: bool = False,
-        restart: bool = False,
-        patience_s: float = PATIENCE_S,
-        held: bool = False,
-    ) -> None:
+        self, folder: Path, verb: str, study: Any, *, resume: bool = False, restart: bool = False,
+        patience_s: float = PATIENCE_S, held: bool = False,
+    ) -> None:  # fmt: skip
         self.parent, self.folder, self.verb, self.study = folder, folder / FOLDER, verb, study
         self._resume, self._restart, self._patience_s, self._is_locked = resume, restart, patience_s, held
         self.damaged = 0  # number of unusable files
@@ -243,7 +236,7 @@ class Checkpoint:
         try:
             data = read_bytes(path, "shard")
             body, digest = data[:-DIGEST_BYTES], data[-DIGEST_BYTES:]
-            if _named(name, body) != digest:
+            if _file_digest(name, body) != digest:
                 raise ValueError
             with np.load(io.BytesIO(body)) as arrays:
                 return dict(arrays)
@@ -259,6 +252,7 @@ class Checkpoint:
             self._write()
 
     def _write(self) -> None:
+        """Write the shards that are kept, once the run has lasted long enough for a checkpoint."""
         if not self._written and time.monotonic() - self._started < self._patience_s:
             return
         if not self._written and self._unwritten:
@@ -269,7 +263,7 @@ class Checkpoint:
             body = io.BytesIO()
             np.savez(body, **shard)  # type: ignore[arg-type]
             data = body.getvalue()
-            write_whole(self.folder / f"{name}.npz", data, _named(name, data))
+            write_whole(self.folder / f"{name}.npz", data, _file_digest(name, data))
             self._unwritten.pop(0)
 
     @property
@@ -306,7 +300,7 @@ class Checkpoint:
 
     def _write_manifest(self) -> None:
         manifest = self._manifest()
-        text = json.dumps(manifest | {"digest": _digest_of(manifest)}, indent=2)
+        text = json.dumps(manifest | {"digest": _manifest_digest(manifest)}, indent=2)
         write_whole(self.folder / MANIFEST, text.encode())
 
 
@@ -329,16 +323,17 @@ def _intact(manifest: Path) -> dict[str, Any] | None:
     """Return the content of a manifest without its digest, or None if it is not an intact one of a checkpoint."""
     try:
         content = json.loads(read_bytes(manifest, "manifest"))
-        is_whole = content.pop("digest") == _digest_of(content) and isinstance(content["study"], dict)
+        is_whole = content.pop("digest") == _manifest_digest(content) and isinstance(content["study"], dict)
         return dict(content) if is_whole else None
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return None
 
 
-def _named(name: str, body: bytes) -> bytes:
+def _file_digest(name: str, body: bytes) -> bytes:
     """Return the digest of a file and its name, which detects renamed files."""
     return hashlib.sha256(name.encode() + b"\0" + body).digest()
 
 
-def _digest_of(manifest: Mapping[str, object]) -> str:
+def _manifest_digest(manifest: Mapping[str, object]) -> str:
+    """Return the digest of the content of a manifest."""
     return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()

@@ -320,6 +320,7 @@ def _engine(device: str | None, threads: int) -> Engine:
 
 
 def _introduce(device: str | None, dask_worker: Any = None) -> tuple[tuple[str, str], DeviceRecord]:
+    """Return the worker's code and device."""
     with _one_at_a_time:
         return code_identity(), _engine(device, dask_worker.state.nthreads).device
 

@@ -7,7 +7,7 @@ import uuid
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from queue import SimpleQueue
@@ -91,6 +91,7 @@ class LocalWorkers:
         return self._threads.submit(self._count, task)
 
     def _count(self, task: Task) -> Arrays:
+        """Count a shard with a free engine, which a failure replaces by a new one."""
         if self._stopping:
             raise Stopped
         place, self._current.task = self._free.get(), task
@@ -100,7 +101,7 @@ class LocalWorkers:
         except engine.open_device.cl.Error as error:
             if self._stopping:
                 raise
-            # A failed launch may have corrupted the context, so the next shard is counted in a new one.
+            # A failed launch may have corrupted the context.
             self._engines[place] = self._make(self._devices[place], progress=self._report_progress)
             raise ShardLost(f"{engine.device_name}: {error}") from error
         finally:
@@ -117,16 +118,16 @@ class LocalWorkers:
         self._threads.shutdown(wait=True)
 
 
-@dataclass(frozen=True)
+@dataclass
 class PoolProgress:
     """Progress of a pool."""
 
-    done: int  # realisations
-    total: int  # realisations of all known or announced requests
-    shards: int  # counted shards
-    of: int  # shards of all known requests
-    retries: int  # shards that were counted again, because a device failed or a worker died
-    resumed: int  # realisations taken from a checkpoint
+    done: int = 0  # realisations
+    total: int = 0  # realisations of all known or announced requests
+    shards: int = 0  # counted shards
+    of: int = 0  # shards of all known requests
+    retries: int = 0  # shards that were counted again, because a device failed or a worker died
+    resumed: int = 0  # realisations taken from a checkpoint
 
 
 @validated
@@ -156,13 +157,13 @@ class Pool:
         self.workers = LocalWorkers() if workers is None else workers
         self.checkpoint, self._progress, self._meanwhile = checkpoint, progress, meanwhile
         self._lock = threading.RLock()
-        self._done = self._total = self._shards = self._of = self._resumed = self._expected = self._retries = 0
-        self._partly: dict[str, int] = {}
+        # Finished shards; counted realisations of others, by the names of their tasks; and the announced total.
+        self._finished, self._partly, self._expected = PoolProgress(), dict[str, int](), 0
         self._stopping = False
 
     def expect(self, realisations: Annotated[int, Range(0)]) -> None:
         """Announce a number of further realisations, for an estimate of the remaining time; the largest total holds."""
-        self._expected = max(self._expected, self._total + realisations)
+        self._expected = max(self._expected, self._finished.total + realisations)
 
     def stop(self) -> None:
         """Stop all work in progress, including that of other threads."""
@@ -183,9 +184,8 @@ class Pool:
     @property
     def standing(self) -> PoolProgress:
         """Progress of the work."""
-        partly = sum(self._partly.values())
-        total = max(self._total, self._expected)
-        return PoolProgress(self._done + partly, total, self._shards, self._of, self._retries, self._resumed)
+        done = self._finished.done + sum(self._partly.values())
+        return replace(self._finished, done=done, total=max(self._finished.total, self._expected))
 
     def detect(self, quiet: Expectation, flares: Sequence[Expectation] | Expectation, **how: Any) -> Detection:
         """Compute a detection; parameters as for `Engine.detect`."""
@@ -229,8 +229,8 @@ class Pool:
         """Count all shards of a request, and call `add` with the part of each and its arrays."""
         key, todo = fingerprint(request), shards(request)
         with self._lock:
-            self._total += sum(shard.count for shard in todo)
-            self._of += len(todo)
+            self._finished.total += sum(shard.count for shard in todo)
+            self._finished.of += len(todo)
         self._report_progress()
 
         def missing() -> Iterator[Task]:
@@ -242,13 +242,13 @@ class Pool:
                     yield task
                 else:
                     add(shard.part, resumed)
-                    self._finished(task, resumed=True)
+                    self._finish(task, resumed=True)
 
         for task, counted in self._counted(missing()):
             add(task.shard.part, counted)
             if self.checkpoint is not None:
                 self.checkpoint.put(task.name, counted)
-            self._finished(task)
+            self._finish(task)
 
     def _counted(self, tasks: Iterable[Task]) -> Iterator[tuple[Task, Arrays]]:
         """Count tasks with all workers, and yield them with their arrays, in the order in which they are finished."""
@@ -273,12 +273,13 @@ class Pool:
                         fault = f"{task.shard} failed {MAX_FAILURES} times, the last time with: {lost}"
                         raise DeviceError(fault, "failed") from lost
                     with self._lock:
-                        self._retries += 1
+                        self._finished.retries += 1
                     waiting[self.workers.submit(task)] = task
                 else:
                     yield task, counted
 
     def _tick(self, name: str, done: int) -> None:
+        """Note the counted realisations of a shard in progress; the first call starts `meanwhile`."""
         with self._lock:
             self._partly[name] = done
             meanwhile, self._meanwhile = self._meanwhile, None
@@ -286,12 +287,13 @@ class Pool:
             threading.Thread(target=meanwhile, name="mauvecl-meanwhile", daemon=True).start()
         self._report_progress()
 
-    def _finished(self, task: Task, *, resumed: bool = False) -> None:
+    def _finish(self, task: Task, *, resumed: bool = False) -> None:
+        """Note that a shard is counted, or `resumed` from the checkpoint."""
         with self._lock:
             self._partly.pop(task.name, None)
-            self._done += task.shard.count
-            self._shards += 1
-            self._resumed += task.shard.count if resumed else 0
+            self._finished.done += task.shard.count
+            self._finished.shards += 1
+            self._finished.resumed += task.shard.count if resumed else 0
         self._report_progress()
 
     def _report_progress(self) -> None:

@@ -30,8 +30,7 @@ from mauvecl.host.tables.files import NO_ROOM, UNFINISHED, read_bytes, toml, wri
 from mauvecl.runs.checkpoint import differing_keys
 from mauvecl.schema.columns import Column, percent
 from mauvecl.schema.errors import InputError, missing_package
-from mauvecl.study.cases import cases, full_label
-from mauvecl.study.cases import collect_messages as messages_of
+from mauvecl.study.cases import cases, collect_messages, full_label
 from mauvecl.study.study import Study, read_version
 
 #: Units of the calibration per pixel and frame, which each star's group contains.
@@ -55,17 +54,18 @@ def _describe(root: Any, scene: StoredScene, study: Study) -> None:
 
     x, group = scene.expectation, root.require_group(scene.group)
 
-    def store(name: str, values: NDArray[Any], unit: str, dimension: str = "pixel") -> None:
+    def add(name: str, values: NDArray[Any], unit: str, dimension: str = "pixel") -> None:
+        """Add an array of one value for each pixel, or each frame, to the group."""
         options: Any = {"chunks": values.shape, "compressors": [Crc32cCodec()], "dimension_names": [dimension]}
         group.create_array(name, data=values, **options).attrs["units"] = unit
 
     if scene.name == "quiescent":
         group.attrs.update({"star": scene.star, **scene.at})
-        group.attrs.update(exposure_attributes(x) | {"messages": messages_of([x])})
+        group.attrs.update(exposure_attributes(x) | {"messages": collect_messages([x])})
         for name, unit in CALIBRATION.items():
-            store(name, np.asarray(getattr(x, name)), unit)
+            add(name, np.asarray(getattr(x, name)), unit)
         if scene.frames is not None:
-            store("frame", np.array(scene.frames), "", "frame")
+            add("frame", np.array(scene.frames), "", "frame")
     if study.bulk.components:
         n = x.n_frames if scene.frames is None else 1
         gain = n * x.gain_dn_per_electron
@@ -75,7 +75,7 @@ def _describe(root: Any, scene: StoredScene, study: Study) -> None:
             *([("neighbours", gain * x.neighbour_electrons)] if x.neighbour_electrons.any() else []),
             ("noise", np.sqrt(x.variance_dn2 * n / x.n_frames)),
         ):
-            store(f"{scene.name}-{name}", values, "DN")
+            add(f"{scene.name}-{name}", values, "DN")
     array = group.create_array(
         scene.name,
         shape=(scene.rows, *scene.row),

@@ -1,1 +1,0 @@
-"""OpenCL C sources (Mako templates) for pixels; stars are unknown here."""
