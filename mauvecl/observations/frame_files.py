@@ -20,7 +20,7 @@ from mauvecl.host.tables.fits_tables import FitsTables
 from mauvecl.host.tables.names import is_magnitude, is_missing, key_of
 from mauvecl.host.tables.opening import open_table
 from mauvecl.host.tables.table import MemoryTable, TableFile, Values, convert, unit_in, without_indefinite
-from mauvecl.host.tables.units import is_dated, unit_and_medium, vacuum_wavelengths
+from mauvecl.host.tables.units import counts_unit, is_dated, unit_and_medium, vacuum_wavelengths
 from mauvecl.observations import stored_frames as stored
 from mauvecl.observations.frames import ALL_BITS, MAX_FRAMES, Frames, QualityBits
 from mauvecl.observations.mapping import COLUMN_NAMES, FrameMapping, recognised, times_of
@@ -458,7 +458,8 @@ def _linear_light(quantities: Quantities, mapping: FrameMapping) -> tuple[str, V
         raise InputError(f"{named} is in {error_unit}, and {flux.name!r} is not; {remedy}", key="error")
     if error_unit and unit and error_unit not in (unit, file_unit):
         try:
-            factor = float(unit_in(error_unit).to(unit_in(unit)))
+            of_error, of_light = (counts_unit(text) or unit_in(text) for text in (error_unit, unit))
+            factor = float(of_error.to(of_light))
         except (ValueError, TypeError) as cause:
             fault = f"{named} must have a unit like that of {flux.name!r}, {unit}, not {error_unit}"
             raise InputError(fault, key="error") from cause
