@@ -87,6 +87,25 @@ def unit_of(text: str) -> u.UnitBase | u.function.FunctionUnitBase:
     return _linear_unit(name, text, expected)
 
 
+#: Counts by astropy's names; DN and adu are the same. A minus before a digit is that of an exponent, as in 1e-3.
+_COUNTS = {
+    name: re.compile(rf"(?<![\w.])(?:{words})(?!\w)", re.IGNORECASE)
+    for name, words in {"adu": "dn|adu", "electron": r"e\^?-|electrons?", "count": "counts?|cts?"}.items()
+}
+
+
+def counts_unit(text: str) -> u.UnitBase | None:
+    """Return the unit in a text, if it is one of counts in any usual spelling, as ``e-/s`` or ``DN/sec``, or None."""
+    name, n_found = in_brackets(text.translate(_TYPOGRAPHY)), 0
+    for unit, words in _COUNTS.items():
+        name, n = words.subn(unit, name)
+        n_found += n
+    try:
+        return _linear_unit(name, text, "a unit of counts") if n_found else None
+    except InputError:
+        return None
+
+
 def counts_in(text: str) -> tuple[float, bool] | None:
     """Return the number that is one DN, or one DN/s, in a unit of counts, and whether it is a rate.
 
@@ -94,11 +113,7 @@ def counts_in(text: str) -> tuple[float, bool] | None:
     """
     import astropy.units as u
 
-    name, n_found = re.subn(r"\b(?:dn|adu)\b", "adu", text.translate(_TYPOGRAPHY), flags=re.IGNORECASE)
-    try:
-        unit = _linear_unit(in_brackets(name), text, "adu or DN") if n_found else u.one
-    except InputError:
-        return None
+    unit = counts_unit(text) or u.one
     counts = next((counts for counts in (u.adu, u.adu / u.s) if counts.is_equivalent(unit)), None)
     return None if counts is None else (float(counts.to(unit)), counts != u.adu)
 

@@ -17,10 +17,10 @@ from mauvecl.host.arrays import Float
 from mauvecl.host.stars.columns import words_of
 from mauvecl.host.tables.files import check_content, parsing, without_columns
 from mauvecl.host.tables.fits_tables import FitsTables
-from mauvecl.host.tables.names import is_magnitude, is_missing, key_of
+from mauvecl.host.tables.names import first_of, is_magnitude, is_missing, key_of
 from mauvecl.host.tables.opening import open_table
 from mauvecl.host.tables.table import MemoryTable, TableFile, Values, convert, unit_in, without_indefinite
-from mauvecl.host.tables.units import is_dated, unit_and_medium, vacuum_wavelengths
+from mauvecl.host.tables.units import counts_unit, is_dated, unit_and_medium, vacuum_wavelengths
 from mauvecl.observations import stored_frames as stored
 from mauvecl.observations.frames import ALL_BITS, MAX_FRAMES, Frames, QualityBits
 from mauvecl.observations.mapping import COLUMN_NAMES, FrameMapping, recognised, times_of
@@ -427,6 +427,8 @@ def _read_light(
     if len(light.shape) == 1:
         light, sd, unit, on_level = _relative_to_level(light, sd, unit)
         notes += on_level
+        if not np.isfinite(light).any():
+            raise _without_light(file, flux.name)
     remarks += (*more, *(f"{file.label}: {text}" for text in notes))
     if sd is not None and not np.isfinite(sd).any():
         # lightkurve writes a column of NaN for errors that it does not know.
@@ -435,6 +437,18 @@ def _read_light(
     if "quality" in quantities and len(quantities["quality"].shape) == 1:
         flags = quantities["quality"].numbers()
     return light, sd, flags, unit, remarks
+
+
+def _without_light(file: TableFile, flux: str) -> InputError:
+    """Return the error of a column of light without a number, with the mapping of another column of light."""
+    usual = (first_of((name,), file.columns, file.label) for name in COLUMN_NAMES["flux"])
+    columns = (file.find(name) for name in usual if name is not None and name != flux)
+    others = [column.name for column in columns if np.isfinite(column.numbers()).any()]
+    remedy = "give a column of light in a mapping with flux"
+    if others:
+        keys = recognised(file, others[0]).model_dump(mode="json", exclude_unset=True)
+        remedy = f"give a mapping such as {', '.join(f'{key} = {value!r}' for key, value in keys.items())}"
+    return InputError(f"{file.label}: {flux!r} holds no finite number; {remedy}", key="flux")
 
 
 def _excluding_bits(quality: Values | None, bits: QualityBits) -> Values | None:
@@ -468,7 +482,8 @@ def _linear_light(quantities: Quantities, mapping: FrameMapping) -> tuple[str, V
         raise InputError(f"{named} is in {error_unit}, and {flux.name!r} is not; {remedy}", key="error")
     if error_unit and unit and error_unit not in (unit, file_unit):
         try:
-            factor = float(unit_in(error_unit).to(unit_in(unit)))
+            of_error, of_light = (counts_unit(text) or unit_in(text) for text in (error_unit, unit))
+            factor = float(of_error.to(of_light))
         except (ValueError, TypeError) as cause:
             fault = f"{named} must have a unit like that of {flux.name!r}, {unit}, not {error_unit}"
             raise InputError(fault, key="error") from cause

@@ -140,12 +140,13 @@ CHEOPS = "SCI_COR_LIGHTCURVE"
 DATE = "a number or a date such as 2026-03-01T12:00:00"
 
 
-def recognised(file: TableFile) -> FrameMapping:
-    """Return the mapping of a file whose columns have known names."""
+def recognised(file: TableFile, flux: str | None = None) -> FrameMapping:
+    """Return the mapping of a file whose columns have known names, by default of the first known column of light."""
     file.check_choice()
     # FITS files also have images, and columns of other extensions, which do not count.
     names = [*file.columns, *(name for name in file.names if "/" not in name and name not in file.columns)]
     columns: dict[str, Any] = {key: first_of(usual, names, file.label) for key, usual in COLUMN_NAMES.items()}
+    columns["flux"] = flux or columns["flux"]
     if columns["time"] is None:
         times = {name: time for name in names if (time := units.time_in_name(name)) is not None}
         dated = [name for name, time in times.items() if time.epoch_mjd is not None]
