@@ -46,12 +46,21 @@ AMPLITUDES = (1e-2, 1e5)
 SCALES = (1.5, 3.0)
 #: Quality factor of a smooth term, as of granulation (Foreman-Mackey et al. 2017).
 SMOOTH_QUALITY = 2**-0.5
+#: Number of values above which a process is fitted by Fisher scoring; fits to fewer are quick.
+MANY = 1000
 #: Largest number of iterations of a fit, and the change of log likelihood at which it has converged.
 ITERATIONS, CONVERGED = 80, 1e-3
-#: Step of a parameter for the derivatives of a fit.
-DIFFERENCE = 1e-8
-#: Largest number of consecutive fits, and the change of log likelihood below which no further one follows.
+#: Step of a parameter for the derivatives of a fit to few values, and to many at first.
+SMALL, FIRST_DIFFERENCE = 1e-8, 1e-5
+#: Largest number of consecutive fits to few values, and change of log likelihood below which no further one follows.
 STARTS, SAME = 4, 0.5
+#: Later step of a parameter for the derivatives of a fit to many values, in its standard errors, and its range.
+DIFFERENCE, DIFFERENCES = 1e-3, (1e-8, 1e-3)
+#: Damping of a fit relative to the information: the smallest, the least after a step that fails, and the largest.
+LEAST_DAMPING, DAMPING, MOST_DAMPING = 1e-6, 1e-2, 1e6
+#: Largest change of a parameter in a step, and change of the log likelihood, over the expected one, below which the
+#: damping rises and above which it falls.
+LONGEST_STEP, DOUBTFUL, FAITHFUL = 1.0, 0.25, 0.75
 #: Largest change of the logarithm of a period in a fit, and bounds of the parameters beyond the first two.
 NEAR_PERIOD = 0.4
 BOUNDS: dict[Kind, tuple[tuple[float, float], ...]] = {
@@ -235,7 +244,8 @@ class Covariance:
         self._d, self._w = driver.factor(self._time, self._rates, diagonal, self._u, v, diagonal, v)
         if not (self._d > 0).all():
             raise np.linalg.LinAlgError("the covariance is not positive definite")
-        self.log_determinant = float(np.log(self._d).sum())
+        self.log_variances = np.log(self._d)  # of the innovations
+        self.log_determinant = float(self.log_variances.sum())
 
     def _solved_lower(self, values: Float) -> Float:
         out = np.array(values.reshape(len(values), -1), np.float64, order="C")
@@ -459,17 +469,89 @@ def _fit_terms(data: BinnedLightCurve, terms: tuple[ProcessTerm, ...], log_exces
         value = 0.5 * ((x[0] - expected) / NOISE_PRIOR) ** 2 - level_fit(covariance, data.values)[1]
         return value if np.isfinite(value) else 1e25
 
+    x, size = np.clip(start, low, high), start.size * float(np.log(data.values.size))
+    if data.values.size > MANY:
+        x, value = _score(lambda x: _innovations(process_of(x), data), x, low, high)
+    else:
+        x, value = _descend(cost, x, low, high)
+    return process_of(x), 2 * value + size
+
+
+def _descend(cost: Callable[[Float], float], x: Float, low: Float, high: Float) -> tuple[Float, float]:
+    """Return the parameters within bounds at which a quasi-Newton method ends, and their cost."""
+
     def cost_and_slopes(x: Float) -> tuple[float, Float]:
         # Differences forwards, or backwards at an upper bound, as scipy's, whose checks take as long as a cost.
-        value, moved = cost(x), x + np.diag(np.where(x + DIFFERENCE <= high, DIFFERENCE, -DIFFERENCE))
+        value, moved = cost(x), x + np.diag(np.where(x + SMALL <= high, SMALL, -SMALL))
         return value, (np.array([cost(row) for row in moved]) - value) / (np.diag(moved) - x)
 
-    x, value = np.clip(start, low, high), np.inf
     options: Any = {"maxiter": ITERATIONS, "ftol": CONVERGED / max(abs(cost(x)), 1.0)}
+    bounds, value = list(zip(low.tolist(), high.tolist(), strict=True)), np.inf
     # The estimate of the curvature may mislead a fit, which another one from its end on shows.
     for _ in range(STARTS):
         best = scipy.optimize.minimize(cost_and_slopes, x, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
         x, before, value = best.x, value, float(best.fun)
         if before - value < SAME:
             break
-    return process_of(x), 2 * value + start.size * float(np.log(data.values.size))
+    return x, value
+
+
+def _innovations(process: Process, data: BinnedLightCurve) -> Float | None:
+    """Return normalised innovations and the logarithms of their variances, shape (2, n + 2).
+
+    They are None if the covariance is not positive definite or a value is not finite. Half of the
+    sum of the squares and logarithms is minus the log likelihood. The last of each are the prior of the noise and the
+    integral over the mean.
+    """
+    try:
+        covariance = process.covariance(data.time_s, data.variance * process.excess**2)
+    except (np.linalg.LinAlgError, RuntimeError, ValueError):
+        return None
+    _, log_likelihood, innovations = level_fit(covariance, data.values)
+    prior = (np.log(process.excess) - data.log_excess) / NOISE_PRIOR
+    of_mean = -2 * log_likelihood - float(innovations @ innovations) - covariance.log_determinant
+    parts = np.array([np.append(innovations, [prior, 0.0]), np.append(covariance.log_variances, [0.0, of_mean])])
+    return parts if np.isfinite(parts).all() else None
+
+
+def _cost(parts: Float | None) -> float:
+    """Return minus the log likelihood by its innovations."""
+    return 1e25 if parts is None else 0.5 * float(parts[0] @ parts[0] + parts[1].sum())
+
+
+def _score(parts_of: Callable[[Float], Float | None], x: Float, low: Float, high: Float) -> tuple[Float, float]:
+    """Return the parameters within bounds for which `_innovations` have the least cost, and this cost.
+
+    Derivatives of the innovations and of their variances give the expected curvature, without second derivatives
+    (Fisher scoring), to which the damping of Levenberg and Marquardt is added.
+    """
+    parts, damping, difference = parts_of(x), DAMPING / 10, np.full(x.size, FIRST_DIFFERENCE)
+    for _ in range(ITERATIONS):
+        cost, moved = _cost(parts), x + np.diag(np.where(x + difference <= high, difference, -difference))
+        others = [other for row in moved if (other := parts_of(row)) is not None]
+        if parts is None or len(others) < x.size:
+            break
+        values, logs = ((np.stack(others) - parts) / (np.diag(moved) - x)[:, None, None]).transpose(1, 0, 2)
+        gradient = values @ parts[0] + 0.5 * logs.sum(axis=1)
+        values = values + 0.5 * logs * parts[0]
+        information = values @ values.T + 0.5 * logs @ logs.T
+        power = np.maximum(np.diag(information), 1e-12)
+        difference = np.clip(DIFFERENCE / np.sqrt(power), *DIFFERENCES)
+        limits = np.maximum(low - x, -LONGEST_STEP), np.minimum(high - x, LONGEST_STEP)
+        while True:
+            root = np.linalg.cholesky(information + np.diag(damping * power))
+            goal = -scipy.linalg.solve_triangular(root, gradient, lower=True)
+            step = scipy.optimize.lsq_linear(root.T, goal, limits, "bvls", max_iter=10 * x.size).x
+            expected = -float(step @ (gradient + 0.5 * information @ step))
+            if damping > MOST_DAMPING or (damping <= DAMPING and expected < CONVERGED):
+                return x, cost
+            tried = parts_of(np.clip(x + step, low, high))
+            if (fall := cost - _cost(tried)) > 0:
+                break
+            damping = max(8 * damping, DAMPING)
+        x, parts = np.clip(x + step, low, high), tried
+        if fall > FAITHFUL * expected:
+            damping = max(damping / 10, LEAST_DAMPING)
+        elif fall < DOUBTFUL * expected:
+            damping *= 4
+    return x, _cost(parts)

@@ -99,6 +99,18 @@ def test_table_of_events_has_the_flare_in_its_units() -> None:
     assert [row["ed_fit_low"], row["ed_fit_high"]] == [row["ed_low"], row["ed_high"]]
 
 
+def test_fits_of_a_process_to_many_frames_do_not_depend_on_their_start() -> None:
+    time = 1800.0 * np.arange(1500)
+    star = process(rotation=[3.0, 103_680.0, 10.0, 1.0, 0.3], correlated=[2.0, 43_200.0])
+    starts = [replace(star, terms=(star.terms[0], *process(correlated=[1.0, scale]).terms)) for scale in (1e4, 2.6e6)]
+    for seed in range(4):
+        light = star.covariance(time, np.ones(1500)).coloured(np.random.default_rng(seed).standard_normal(1500))
+        data = processes.BinnedLightCurve(time, light, np.ones(1500), 1800.0)
+        found = [processes.criterion_of_process(processes.fit_process(data, one), data, 0.0) for one in starts]
+        assert np.ptp(found) < 0.1
+        assert max(found) < processes.criterion_of_process(star, data, 0.0)
+
+
 @pytest.mark.parametrize(("seed", "n", "frame_s", "period_s", "sizes", "noise"), [
     (7, 300, 1800.0, 172_800.0, (0.021, 0.0), 2e-4),
     pytest.param(8, 600, 1800.0, 40_600.0, (0.022, 0.008), 8e-4, marks=pytest.mark.long),
