@@ -13,20 +13,7 @@ from scenes import through
 from tables import DATA
 
 import mauvecl
-from mauvecl import (
-    BalmerFlare,
-    Blackbody,
-    Engine,
-    FlareWithLines,
-    Instrument,
-    Source,
-    Stares,
-    Study,
-    detect,
-    expect,
-    simulate,
-    stare,
-)
+from mauvecl import Blackbody, Engine, Instrument, Source, Stares, Study, detect, expect, simulate, stare
 
 PART = {"changes": {"output_min_nm": 300.0, "output_max_nm": 330.0}}
 
@@ -115,11 +102,11 @@ OF_FILE: dict[str, Any] = {
 #: Section of a study for each spectrum, and the spectrum at 9000 K.
 TEXTS: dict[str, tuple[dict[str, Any], Any]] = {
     "blackbody": ({}, Blackbody(9000.0)),
-    "jump": ({"balmer_jump": 2.5, "electron_temperature_k": 8000.0}, BalmerFlare(9000.0, 2.5, 8000.0)),
+    "jump": ({"balmer_jump": 2.5, "electron_temperature_k": 8000.0}, mauvecl.BalmerFlare(9000.0, 2.5, 8000.0)),
     "two": ({"second_temperature_k": 25_000.0, "second_area": 0.1}, mauvecl.TwoBlackbodies(9000.0, 25_000.0, 0.1)),
     "lines": (
         {"lines": {"Mg II": 0.04, "H alpha": 0.1}, "line_scale": 0.5, "balmer_jump": 2.0},
-        FlareWithLines(BalmerFlare(9000.0, 2.0), {"Mg II": 0.02, "H alpha": 0.05}),
+        mauvecl.FlareWithLines(mauvecl.BalmerFlare(9000.0, 2.0), {"Mg II": 0.02, "H alpha": 0.05}),
     ),
     "file": (OF_FILE, mauvecl.ObservedFlare.read(FILE, QUIET, wavelength_unit="Angstrom", continue_at_k=9500.0)),
 }
@@ -203,7 +190,7 @@ def test_search_injects_the_flare_of_the_file() -> None:
 
 def test_lines_of_a_fixed_flux_do_not_scale() -> None:
     star = Source.from_library("M3V").at_magnitude(9)
-    fixed = FlareWithLines(Blackbody(9000.0), {}, {"Mg II": 1e-12, "H beta": 2e-12})
+    fixed = mauvecl.FlareWithLines(Blackbody(9000.0), {}, {"Mg II": 1e-12, "H beta": 2e-12})
     for amplitude in (0.01, 0.1):
         plain, lit = star.flaring(amplitude, 9000.0), star.flaring(amplitude, spectrum=fixed)
         near = (lit.wavelength_nm > 279) & (lit.wavelength_nm < 281)
