@@ -6,7 +6,7 @@ Departures say by how much simulated false-alarm probabilities differ from close
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
@@ -27,7 +27,7 @@ from mauvecl.detection.distributions import (
     clopper_pearson_ends,
     detection_interval,
 )
-from mauvecl.detection.requests import ChannelPlan, Hypotheses, Key
+from mauvecl.detection.requests import ChannelPlan, DetectRequest, Hypotheses, Key
 from mauvecl.detection.statistics import Differences, LinearStatistic, Statistic
 from mauvecl.detection.tails import Tail, tail
 from mauvecl.host.arrays import ContentEquality, Float
@@ -362,6 +362,15 @@ TAIL_COLUMNS = (
     Column("realisation", "realisations", description="number of the realisation, by which it can be drawn again"),
     Column("value", "values", description="of the statistic, as the device computed it"),
 )
+
+
+def detection_of(request: DetectRequest, tallies: Iterable[Tally]) -> Detection:
+    """Return the result of a request from the tallies of its parts."""
+    detection = Detection.of(request.hypotheses, request.realisations, request.tails, request.seed)
+    for plan, tally in zip(request.plans, tallies, strict=True):
+        detection.collect(plan, tally, tally.tails)
+    return detection
+
 
 #: Differences above this many standard errors are significant.
 SIGNIFICANT = 4.0

@@ -1,8 +1,8 @@
-"""Distributions of the S/N of pixels and resolution elements, and results of requests from the sums of their shards."""
+"""Distributions of the S/N of pixels and resolution elements over realisations."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.detection.counts import RowCounts, Tally, steps_of
-from mauvecl.detection.detection import Detection
-from mauvecl.detection.requests import DetectRequest, SnrRequest
+from mauvecl.detection.counts import RowCounts, steps_of
+from mauvecl.detection.requests import SnrRequest
 from mauvecl.host.arrays import Arrays, ContentEquality, Float
 from mauvecl.noise import layout
 from mauvecl.noise.reference import Floats, fma
@@ -245,11 +244,3 @@ class SnrResult(Drawable, ContentEquality):
 def counts_of(request: SnrRequest) -> Counts:
     """Return the empty histograms of a request."""
     return Counts(request.scene.n_pixel, request.expectation.element_wavelength_nm.size)
-
-
-def detection_of(request: DetectRequest, tallies: Iterable[Tally]) -> Detection:
-    """Return the result of a request from the tallies of its parts."""
-    detection = Detection.of(request.hypotheses, request.realisations, request.tails, request.seed)
-    for plan, tally in zip(request.plans, tallies, strict=True):
-        detection.collect(plan, tally, tally.tails)
-    return detection

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mauvecl.detection import DEFAULT_STATISTICS, Tails, requests, snr
 from mauvecl.detection.counts import Tally
-from mauvecl.detection.detection import Detection
+from mauvecl.detection.detection import Detection, detection_of
 from mauvecl.detection.nuisances import Nuisances
 from mauvecl.detection.snr import Counts, SnrResult
 from mauvecl.detection.statistics import Linear
@@ -275,7 +275,7 @@ class Engine:
         n = request.realisations
         shards = [requests.Shard(part, request.start, n) for part in range(request.parts)]
         tallies = (self._detection(request, shard, before=shard.part * n, total=len(shards) * n) for shard in shards)
-        return snr.detection_of(request, tallies)
+        return detection_of(request, tallies)
 
     def _detection(
         self, request: requests.DetectRequest, shard: requests.Shard, *, before: int = 0, total: int | None = None

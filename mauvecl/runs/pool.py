@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from numpy.typing import NDArray
 
+from mauvecl.detection.detection import Detection, detection_of
 from mauvecl.detection.requests import DetectRequest, RealiseRequest, Shard, SnrRequest
-from mauvecl.detection.snr import SnrResult, counts_of, detection_of
+from mauvecl.detection.snr import SnrResult, counts_of
 from mauvecl.device.engine import DeviceError, DeviceRecord, Engine
 from mauvecl.device.launches import Progress
 from mauvecl.host.arrays import Arrays, map_in_threads
@@ -25,7 +26,6 @@ from mauvecl.schema.calls import validated
 from mauvecl.schema.fields import Range, Realisations
 
 if TYPE_CHECKING:
-    from mauvecl.detection.detection import Detection
     from mauvecl.device.stares import Stares
     from mauvecl.flares.stare_scene import StaresRequest
     from mauvecl.host.exposure.expectation import Expectation
