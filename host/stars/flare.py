@@ -339,7 +339,7 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         ends = float(self.wavelength_nm[0]), float(self.wavelength_nm[-1])
         if ends[0] > NEEDED_NM[0] or ends[1] < NEEDED_NM[1]:
             fault = f"the flare spectrum {self.name} must cover {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm, but covers"
-            remedy = "give the temperature of a blackbody that continues it"
+            remedy = "`continue_at_k=10000` continues it by a blackbody of this temperature"
             raise InputError(f"{fault} {ends[0]:g}-{ends[1]:g} nm; {remedy}", key="continue_at_k")
         if self.measured_nm == (0.0, 0.0):
             object.__setattr__(self, "measured_nm", ends)

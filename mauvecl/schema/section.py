@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import math
+import re
 from collections.abc import Iterator, Sequence
 from typing import Any, Self, TypeVar, get_args
 
@@ -12,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from pydantic.fields import FieldInfo
 
 from mauvecl.schema import fields
-from mauvecl.schema.errors import InputError, shortened, shown, together
+from mauvecl.schema.errors import REMEDY, InputError, shortened, shown, together
 
 
 class Record(BaseModel):
@@ -215,6 +216,22 @@ def fields_of(section: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[
 def given_keys(section: Section, keys: Sequence[str]) -> list[str]:
     """Return those of `keys` that a section gives."""
     return [key for key in keys if (value := getattr(section, key)) is not None and value is not False]
+
+
+@contextlib.contextmanager
+def reading_for(section: Section, path: str) -> Iterator[None]:
+    """Name keys of a section by their path in the study where an error in the block proposes them.
+
+    Readers of files propose their own parameters, which several sections have as keys.
+    """
+
+    def with_path(match: re.Match[str]) -> str:
+        return f"`{path}.{match[0][1:]}" if match["key"] in type(section).model_fields else match[0]
+
+    try:
+        yield
+    except InputError as error:
+        raise InputError(REMEDY.sub(with_path, str(error)), key=error.key) from error
 
 
 def check_one(section: Section, subject: str, *keys: str, needed: bool = False) -> None:

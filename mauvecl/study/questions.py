@@ -423,9 +423,10 @@ class ChangeQuestion(Section):
 
         if self.file is None:
             return None
-        return Source.read(
-            self.file, wavelength_unit=self.wavelength_unit, flux_unit=self.flux_unit, extend=self.extend
-        )
+        with section.reading_for(self, "change"):
+            return Source.read(
+                self.file, wavelength_unit=self.wavelength_unit, flux_unit=self.flux_unit, extend=self.extend
+            )
 
     def _check_values(self) -> None:
         if not self.shortest_d < self.longest_d:

@@ -14,7 +14,7 @@ from mauvecl.host.stars.library import ALIASES, listed_values
 from mauvecl.schema import fields
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit
-from mauvecl.schema.section import Section, check_all, check_needs, check_one, read_line_fluxes, setting
+from mauvecl.schema.section import Section, check_all, check_needs, check_one, read_line_fluxes, reading_for, setting
 
 if TYPE_CHECKING:
     from mauvecl.host.exposure.background import Neighbours
@@ -334,7 +334,8 @@ class FlareLight(Section):
         light: FlareSpectrum = spectra.Blackbody(temperature_k)
         if self.file is not None:
             units = {"wavelength_unit": self.wavelength_unit, "flux_unit": self.flux_unit}
-            light = spectra.ObservedFlare.read(self.file, self.quiescent, continue_at_k=self.continue_at_k, **units)
+            with reading_for(self, "flare.spectrum"):
+                light = spectra.ObservedFlare.read(self.file, self.quiescent, continue_at_k=self.continue_at_k, **units)
         elif self.second_temperature_k is not None and self.second_area is not None:
             light = spectra.TwoBlackbodies(temperature_k, self.second_temperature_k, self.second_area)
         elif self.balmer_jump is not None:
