@@ -46,20 +46,20 @@ AMPLITUDES = (1e-2, 1e5)
 SCALES = (1.5, 3.0)
 #: Quality factor of a smooth term, as of granulation (Foreman-Mackey et al. 2017).
 SMOOTH_QUALITY = 2**-0.5
-#: Number of values above which a process is fitted by Fisher scoring; fits to fewer are quick.
+#: Number of values above which a process is fitted by `_score`, and not by `_descend`, which is slow for many.
 MANY = 1000
 #: Largest number of iterations of a fit, and the change of log likelihood at which it has converged.
 ITERATIONS, CONVERGED = 80, 1e-3
-#: Step of a parameter for the derivatives of a fit to few values, and to many at first.
-SMALL, FIRST_DIFFERENCE = 1e-8, 1e-5
-#: Largest number of consecutive fits to few values, and change of log likelihood below which no further one follows.
+#: Step of a parameter for the derivatives in `_descend`, and for the first ones in `_score`.
+DESCENT_DIFFERENCE, FIRST_DIFFERENCE = 1e-8, 1e-5
+#: Largest number of consecutive fits in `_descend`, and change of log likelihood below which no further one follows.
 STARTS, SAME = 4, 0.5
-#: Later step of a parameter for the derivatives of a fit to many values, in its standard errors, and its range.
+#: Later step of a parameter in `_score`, in its standard errors, and the range of the step.
 DIFFERENCE, DIFFERENCES = 1e-3, (1e-8, 1e-3)
-#: Damping of a fit relative to the information: the smallest, the least after a step that fails, and the largest.
+#: Damping in `_score`, relative to the information: the least, the least after a step that fails, and the largest.
 LEAST_DAMPING, DAMPING, MOST_DAMPING = 1e-6, 1e-2, 1e6
-#: Largest change of a parameter in a step, and change of the log likelihood, over the expected one, below which the
-#: damping rises and above which it falls.
+#: Largest change of a parameter in a step of `_score`, and changes of the log likelihood, over the expected one, below
+#: which the damping rises and above which it falls.
 LONGEST_STEP, DOUBTFUL, FAITHFUL = 1.0, 0.25, 0.75
 #: Largest change of the logarithm of a period in a fit, and bounds of the parameters beyond the first two.
 NEAR_PERIOD = 0.4
@@ -461,10 +461,8 @@ def _fit_terms(data: BinnedLightCurve, terms: tuple[ProcessTerm, ...], log_exces
         return Process(tuple(fitted), float(np.exp(x[0])))
 
     def cost(x: Float) -> float:
-        process = process_of(x)
-        try:
-            covariance = process.covariance(data.time_s, data.variance * process.excess**2)
-        except (np.linalg.LinAlgError, RuntimeError, ValueError):
+        covariance = _covariance_of(process_of(x), data)
+        if covariance is None:
             return 1e25
         value = 0.5 * ((x[0] - expected) / NOISE_PRIOR) ** 2 - level_fit(covariance, data.values)[1]
         return value if np.isfinite(value) else 1e25
@@ -481,8 +479,8 @@ def _descend(cost: Callable[[Float], float], x: Float, low: Float, high: Float) 
     """Return the parameters within bounds at which a quasi-Newton method ends, and their cost."""
 
     def cost_and_slopes(x: Float) -> tuple[float, Float]:
-        # Differences forwards, or backwards at an upper bound, as scipy's, whose checks take as long as a cost.
-        value, moved = cost(x), x + np.diag(np.where(x + SMALL <= high, SMALL, -SMALL))
+        # These are scipy's differences, whose checks would take as long as a cost.
+        value, moved = cost(x), _moved(x, DESCENT_DIFFERENCE, high)
         return value, (np.array([cost(row) for row in moved]) - value) / (np.diag(moved) - x)
 
     options: Any = {"maxiter": ITERATIONS, "ftol": CONVERGED / max(abs(cost(x)), 1.0)}
@@ -496,16 +494,27 @@ def _descend(cost: Callable[[Float], float], x: Float, low: Float, high: Float) 
     return x, value
 
 
+def _moved(x: Float, step: Float | float, high: Float) -> Float:
+    """Return the parameters with one of them moved by its step in each row, backwards at its upper bound."""
+    return np.asarray(x + np.diag(np.where(x + step <= high, step, -step)))
+
+
+def _covariance_of(process: Process, data: BinnedLightCurve) -> Covariance | None:
+    """Return the covariance of the data if their process is this one, or None if it is not positive definite."""
+    try:
+        return process.covariance(data.time_s, data.variance * process.excess**2)
+    except (np.linalg.LinAlgError, RuntimeError, ValueError):
+        return None
+
+
 def _innovations(process: Process, data: BinnedLightCurve) -> Float | None:
     """Return normalised innovations and the logarithms of their variances, shape (2, n + 2).
 
-    They are None if the covariance is not positive definite or a value is not finite. Half of the
-    sum of the squares and logarithms is minus the log likelihood. The last of each are the prior of the noise and the
-    integral over the mean.
+    Half of the sum of the squares and logarithms is minus the log likelihood. The last two of each are the prior of the
+    noise and the integral over the mean. Return None if the covariance is not positive definite or a value not finite.
     """
-    try:
-        covariance = process.covariance(data.time_s, data.variance * process.excess**2)
-    except (np.linalg.LinAlgError, RuntimeError, ValueError):
+    covariance = _covariance_of(process, data)
+    if covariance is None:
         return None
     _, log_likelihood, innovations = level_fit(covariance, data.values)
     prior = (np.log(process.excess) - data.log_excess) / NOISE_PRIOR
@@ -527,7 +536,7 @@ def _score(parts_of: Callable[[Float], Float | None], x: Float, low: Float, high
     """
     parts, damping, difference = parts_of(x), DAMPING / 10, np.full(x.size, FIRST_DIFFERENCE)
     for _ in range(ITERATIONS):
-        cost, moved = _cost(parts), x + np.diag(np.where(x + difference <= high, difference, -difference))
+        cost, moved = _cost(parts), _moved(x, difference, high)
         others = [other for row in moved if (other := parts_of(row)) is not None]
         if parts is None or len(others) < x.size:
             break
