@@ -384,11 +384,12 @@ def snr(study: Study, engine: Engine | Pool | None = None, progress: Progress = 
 SURE, ERRORS_IN_INTERVAL = 4, 3.92
 #: Smallest ratio of false-alarm probabilities that is distinguished.
 SMALLEST_RATIO = 1e-3
+_SNR_COLUMNS = {column.name: column for column in COLUMNS}
 ELEMENT_COLUMNS = (
-    Column("wavelength", unit="nm", description="vacuum wavelength, the middle of the pixel or element"),
+    _SNR_COLUMNS["wavelength"],
     Column("expected", description="S/N by the formula"),
-    Column("mean", description="mean S/N of the realisations"),
-    Column("std", description="standard deviation of the S/N of the realisations"),
+    _SNR_COLUMNS["mean"],
+    _SNR_COLUMNS["std"],
     Column("error", description="standard error of the mean"),
     Column("bias", description="mean over expected S/N, less one"),
     Column("coverage", description="share of 1-sigma intervals of its pixels that hold the truth; 0.6827 promised"),

@@ -263,7 +263,7 @@ class Scene:
 
     @property
     def clip(self) -> bool:
-        """Whether draws are single frames, which are clipped at the ADC's rails."""
+        """Whether each draw is a single frame, which the limits of the ADC clip."""
         return self.n_draws == self.n_frames
 
     @property
